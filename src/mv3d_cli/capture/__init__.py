@@ -1,0 +1,1 @@
+"""To views: rigs, lighting, rendering, and the procedural shapes that need no data set."""

@@ -1,0 +1,1 @@
+"""Bytes <-> scene values; the only code that opens such files."""

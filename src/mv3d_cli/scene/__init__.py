@@ -1,0 +1,1 @@
+"""Values: frozen dataclasses of arrays. `conventions` states axes, units and colour space for the whole house."""
