@@ -52,9 +52,7 @@ def pixel_from_camera(camera: Camera, width: int, height: int) -> Float[np.ndarr
             return np.array([[fx * width, cx * width], [fy * height, cy * height]])
 
 
-def look_at_origin(
-    name: str, position: tuple[float, float, float], projection: Orthographic | Perspective
-) -> Camera:
+def look_at_origin(name: str, position: tuple[float, float, float], projection: Orthographic | Perspective) -> Camera:
     """A camera at `position` (scene units) that looks at the origin with +Z up in the picture.
 
     Seen straight from above or below, the picture's up is +Y (away from the object's front).

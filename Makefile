@@ -1,0 +1,39 @@
+# make demo and make test do all set-up by themselves: Python 3.11 to 3.13 and make are enough.
+PYTHON ?= python3
+BIN := .venv/bin
+STAMP := .venv/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test lint bench clean
+
+help:  ## show this list
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+install: $(STAMP)  ## make .venv and install mv3d with the tested versions
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \
+		{ echo "mv3d needs Python 3.11, 3.12 or 3.13: make install PYTHON=python3.12"; exit 1; }
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e . --group dev
+	@touch $(STAMP)
+
+demo: $(STAMP)  ## draw 16 objects of our own and print where they are
+	$(BIN)/mv3d render --procedural 16 --size 256 --lighting studio -o out/demo
+	@echo "look at out/demo/sheet.png"
+
+lint: $(STAMP)  ## style, types and the import rule
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+test: lint  ## lint, then the whole test suite
+	$(BIN)/python -m pytest -n 2 -q
+
+bench: $(STAMP)  ## every figure of the README
+	@for script in benchmarks/render_*.py; do echo "## $$script"; $(BIN)/python $$script || exit 1; done
+
+clean:  ## remove the environment and what was built
+	rm -rf .venv out build dist .pytest_cache .ruff_cache

@@ -1,0 +1,59 @@
+"""Textures of meshes: at most 4096 pixels a side, and replaced by grey where they cannot be had."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import UInt8
+
+from mv3d_cli.errors import BadImage, MissingInput
+from mv3d_cli.formats.images import decode_reduced, read_bytes
+from mv3d_cli.scene.conventions import linear_from_srgb
+from mv3d_cli.scene.mesh import Material
+
+MAX_TEXTURE_SIDE = 4096
+GREY = float(linear_from_srgb(np.array([0.5]))[0])
+"""What a surface looks like whose colour is not known: sRGB 0.5, here in linear light."""
+
+GREY_MATERIAL = Material(base_color=(GREY, GREY, GREY, 1.0))
+
+
+class MeshWarning(UserWarning):
+    """A mesh could be read, but not all of it as its author meant it."""
+
+
+@dataclass(frozen=True)
+class TextureFiles:
+    """Decodes each picture of one mesh once; None stands for a picture that cannot be had."""
+
+    mesh: Path
+    decoded: dict[object, UInt8[np.ndarray, "height width 4"] | None] = field(default_factory=dict)
+
+    def pixels(self, key: object, source: Path | bytes | None, label: str) -> np.ndarray | None:
+        """RGBA pixels [height, width, 4] of the file or bytes `source`, remembered under `key`.
+
+        None, after a MeshWarning, where `source` is None (nothing was found), missing, or no picture.
+        """
+        if key not in self.decoded:
+            self.decoded[key] = self._decode(source, label)
+        return self.decoded[key]
+
+    def _decode(self, source: Path | bytes | None, label: str) -> UInt8[np.ndarray, "height width 4"] | None:
+        try:
+            if source is None:
+                raise MissingInput("it was not found.", "")
+            data = source if isinstance(source, bytes) else read_bytes(source)
+            pixels, (width, height) = decode_reduced(data, label, MAX_TEXTURE_SIDE)
+        except (MissingInput, BadImage) as error:
+            self.warn(f"texture {label} is replaced by grey: {error}")
+            return None
+        if max(width, height) > MAX_TEXTURE_SIDE:
+            self.warn(f"texture {label} ({width}x{height}) is reduced to {pixels.shape[1]}x{pixels.shape[0]}.")
+        return pixels
+
+    def warn(self, message: str) -> None:
+        """Say what of this mesh is not as its author meant it."""
+        warnings.warn(f"{self.mesh}: {message}", MeshWarning, stacklevel=2)

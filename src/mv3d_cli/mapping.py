@@ -1,0 +1,78 @@
+"""Map over independent items: in this process, or over worker processes whose crash takes nobody along."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from typing import Any
+
+from mv3d_cli.errors import WorkFailed
+
+AHEAD = 2  # items queued per worker, so that none waits and a crash leaves few to try again
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one item: a result, or the exception that its work raised."""
+
+    item: Any
+    result: Any = None
+    error: Exception | None = None
+
+
+def map_items(
+    function: Callable[[Any], Any],
+    items: Sequence[Any],
+    jobs: int = 1,
+    initializer: Callable[[], None] | None = None,
+) -> Iterator[Outcome]:
+    """Outcomes in the order in which they are ready.
+
+    jobs         1: here, one after another; more: that many worker processes (function and items must pickle)
+    initializer  called once in each worker process
+
+    An exception is the item's outcome, and so is the death of its worker (WorkFailed): the other items go on.
+    """
+    if jobs == 1 or len(items) < 2:
+        for item in items:
+            yield _attempt(function, item)
+        return
+    suspects = yield from _in_pool(function, items, jobs, initializer)
+    for item in suspects:  # a worker died: each item in flight gets a worker of its own, to find the culprit
+        if (yield from _in_pool(function, [item], 1, initializer)):
+            yield Outcome(item, error=WorkFailed("its worker process died", "it may need more memory; try --jobs 1"))
+
+
+def _attempt(function: Callable[[Any], Any], item: Any) -> Outcome:
+    try:
+        return Outcome(item, function(item))
+    except Exception as error:
+        return Outcome(item, error=error)
+
+
+def _in_pool(
+    function: Callable[[Any], Any], items: Sequence[Any], jobs: int, initializer: Callable[[], None] | None
+) -> Iterator[Outcome]:
+    """Outcomes of all items but those in flight when a worker died, which it returns; a new pool takes the rest."""
+    waiting, suspects = list(reversed(items)), []
+    while waiting:
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(min(jobs, len(waiting)), mp_context=context, initializer=initializer)
+        flying: dict[Future[Outcome], Any] = {}
+        try:
+            while waiting or flying:
+                while waiting and len(flying) < jobs * AHEAD:
+                    item = waiting.pop()
+                    flying[pool.submit(_attempt, function, item)] = item
+                for future in wait(flying, return_when=FIRST_COMPLETED).done:
+                    outcome = future.result()
+                    del flying[future]
+                    yield outcome
+        except BrokenProcessPool:
+            suspects += flying.values()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+    return suspects

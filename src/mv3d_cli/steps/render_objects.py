@@ -1,0 +1,230 @@
+"""The work of `mv3d render`, object by object: what there is to draw, drawing one, and the batch that resumes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import warnings
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mv3d_cli.capture.lighting import light_for
+from mv3d_cli.capture.rendering import render
+from mv3d_cli.capture.shapes import procedural_mesh
+from mv3d_cli.capture.sheet import sheet_of_objects, sheet_of_views
+from mv3d_cli.errors import BadMesh, MissingInput, Mv3dError, UsageError
+from mv3d_cli.formats.cameras import load_cameras, select
+from mv3d_cli.formats.images import read_image, write_png
+from mv3d_cli.formats.meshes import MeshFile, find_meshes, mesh_sources, read_mesh
+from mv3d_cli.formats.views_folder import write_views
+from mv3d_cli.kernels.runtime import cpu_count, use_threads
+from mv3d_cli.mapping import Outcome, map_items
+from mv3d_cli.scene.camera import Camera
+from mv3d_cli.scene.mesh import Mesh, transform, unit_sphere_from_mesh
+from mv3d_cli.scene.views import Views
+from mv3d_cli.steps.render import Config
+from mv3d_cli.steps.settings import Progress, Tell, Warned
+from mv3d_cli.store import digest_of_file
+
+SHEET_OBJECTS = 64
+
+
+@dataclass(frozen=True)
+class Object:
+    """One thing to draw: a mesh file, or a procedural seed; `turn` counts its random turns (None: as it stands)."""
+
+    name: str
+    digest: str
+    file: MeshFile | None = None
+    seed: int = 0
+
+    @property
+    def label(self) -> str:
+        return f"mesh {self.name}"
+
+    @property
+    def source(self) -> Path | None:
+        return self.file.path if self.file is not None else None
+
+
+def rig_of(config: Config) -> tuple[Camera, ...]:
+    """The cameras that the settings ask for."""
+    rig = load_cameras(config.cameras)
+    return select(rig, config.views) if config.views else rig
+
+
+def is_batch(inputs: Sequence[Path]) -> bool:
+    """Whether the inputs ask for a data set even if they hold one object only: a folder that is not itself one."""
+    return any(path.is_dir() and find_meshes(path)[0].path.parent.parent != path for path in inputs)
+
+
+def work_of(config: Config, inputs: Sequence[Path]) -> list[Object]:
+    """Every object to draw, names unique, in order. Raises UsageError, MissingInput."""
+    if not inputs and not config.procedural:
+        raise UsageError("there is nothing to render", "give a mesh, a folder of meshes, or --procedural N")
+    files = [file for path in inputs for file in find_meshes(path)]
+    found = [
+        Object(name, _digest(file), file) for name, file in zip(_unique(f.name for f in files), files, strict=True)
+    ]
+    made = [config.seed * 1_000_003 + i for i in range(config.procedural)]
+    return found + [Object(f"procedural_{i:06d}", f"procedural:{seed}", seed=seed) for i, seed in enumerate(made)]
+
+
+def _unique(names: Iterable[str]) -> list[str]:
+    """The names, those met before numbered."""
+    taken: set[str] = set()
+    result = []
+    for name in names:
+        candidate, n = name, 1
+        while candidate in taken:
+            n += 1
+            candidate = f"{name}_{n}"
+        taken.add(candidate)
+        result.append(candidate)
+    return result
+
+
+def _digest(file: MeshFile) -> str:
+    """sha256 over all files that a mesh is read from; a missing or unreadable one counts as such."""
+    total = hashlib.sha256()
+    for path in mesh_sources(file):
+        total.update(path.name.encode() + b"\0")
+        total.update(digest_of_file(path).encode() if path.is_file() else b"missing")
+    return total.hexdigest()
+
+
+def render_one(config: Config, rig: Sequence[Camera], item: Object, folder: Path, tell: Tell) -> None:
+    """One object's views folder, with its contact sheet."""
+    views, notes = _draw(config, rig, item, None, folder)
+    for note in notes:
+        tell(Warned(note))
+    write_png(folder / "sheet.png", sheet_of_views(views))
+
+
+def render_all(config: Config, rig: Sequence[Camera], work: Sequence[Object], folder: Path, tell: Tell) -> None:
+    """A data-set folder: goes on from what lies in `folder`, and does not stop for an object that fails."""
+    turns = list(range(config.rotations)) if config.rotations else [None]
+    places = {_place(item, turn): (item, turn) for item in work for turn in turns}
+    waiting = [place for place in places if not (folder / place).is_dir()]
+    for leftover in folder.glob(".partial-*"):
+        shutil.rmtree(leftover)
+    jobs = min(config.jobs or cpu_count(), len(waiting))
+    todo = [(place, *places[place]) for place in waiting]
+    failures, done = [], len(places) - len(waiting)
+    draw = partial(_draw_into, config, tuple(rig), folder)
+    for outcome in map_items(draw, todo, max(jobs, 1), partial(use_threads, 1)):
+        done += 1
+        if outcome.error is not None:
+            failures.append(_failure(outcome))
+        tell(Progress(done, len(places), "objects"))
+    _finish(folder, places, failures, tell)
+
+
+def _place(item: Object, turn: int | None) -> str:
+    return item.name if turn is None else f"{item.name}_r{turn:03d}"
+
+
+def _draw_into(config: Config, rig: tuple[Camera, ...], folder: Path, todo: tuple[str, Object, int | None]) -> None:
+    """One object of a batch, written beside its place and renamed into it."""
+    place, item, turn = todo
+    partial_folder = folder / f".partial-{place}"
+    try:
+        _draw(config, rig, item, turn, partial_folder)
+        partial_folder.rename(folder / place)
+    except BaseException:
+        shutil.rmtree(partial_folder, ignore_errors=True)
+        raise
+
+
+def _draw(
+    config: Config, rig: Sequence[Camera], item: Object, turn: int | None, folder: Path
+) -> tuple[Views, list[str]]:
+    """Draws one object into a views folder; returns the views and the warnings."""
+    rng = np.random.default_rng([config.seed, int(hashlib.sha256(item.name.encode()).hexdigest()[:8], 16), turn or 0])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        mesh = procedural_mesh(item.seed) if item.file is None else read_mesh(item.file, config.up)
+    notes = [f"{item.name}: {warning.message}" for warning in caught]
+    turned = np.eye(4) if turn is None else random_turn(rng, config.tilt)
+    mesh, world_from_mesh = _placed(mesh, turned)
+    light = light_for(config.lighting, rng)
+    views = _engine(config)(mesh, rig, config.size, light)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_views(folder, views)
+    record = {
+        "name": item.name,
+        "source": item.source.name if item.source is not None else item.digest,
+        "faces": len(mesh.faces),
+        "world_from_mesh": world_from_mesh.tolist(),
+        "scale": float(np.cbrt(np.linalg.det(world_from_mesh[:3, :3]))),
+        "turn": turn,
+        "warnings": notes,
+    }
+    (folder / "object.json").write_text(json.dumps(record, indent=1) + "\n")
+    return views, notes
+
+
+def _engine(config: Config) -> Callable[..., Views]:
+    if config.engine == "blender":
+        from mv3d_cli.capture.blender import render as render_with_blender
+
+        return partial(render_with_blender, samples=config.samples)
+    return partial(render, device="cuda:0" if config.device == "cuda" else config.device)
+
+
+def _placed(mesh: Mesh, turned: Float[np.ndarray, "4 4"]) -> tuple[Mesh, Float[np.ndarray, "4 4"]]:
+    """The mesh turned and brought into the unit sphere, and the similarity that did it. Raises BadMesh."""
+    moved = transform(mesh, turned)
+    similarity = unit_sphere_from_mesh(moved)
+    if not np.isfinite(similarity).all():
+        raise BadMesh("the mesh has no extent", "all of its vertices lie in one place; check the file")
+    return transform(moved, similarity), similarity @ turned
+
+
+def random_turn(rng: np.random.Generator, tilt: float) -> Float[np.ndarray, "4 4"]:
+    """A turn about +Z, even over the circle, then a tip of up to `tilt` degrees about a random horizontal axis."""
+    from scipy.spatial.transform import Rotation
+
+    axis = rng.uniform(0, 2 * np.pi)
+    tip = Rotation.from_rotvec(np.deg2rad(rng.uniform(0, tilt)) * np.array([np.cos(axis), np.sin(axis), 0.0]))
+    turned = np.eye(4)
+    turned[:3, :3] = (tip * Rotation.from_euler("z", rng.uniform(0, 2 * np.pi))).as_matrix()
+    return turned
+
+
+def _failure(outcome: Outcome) -> dict[str, Any]:
+    """The entry of failures.json for an object that did not work."""
+    place, item, _ = outcome.item
+    error = outcome.error
+    reason = str(error) if isinstance(error, Mv3dError) else f"{type(error).__name__}: {error}"
+    hint = error.hint if isinstance(error, Mv3dError) else "this is a fault of mv3d; please report it with the mesh"
+    source = str(item.source) if item.source is not None else item.digest
+    return {"name": place, "source": source, "reason": reason, "hint": hint}
+
+
+def _finish(folder: Path, places: dict[str, Any], failures: list[dict[str, Any]], tell: Tell) -> None:
+    """Index, failures and contact sheet of a batch. Raises MissingInput when nothing could be drawn."""
+    drawn = [place for place in places if (folder / place).is_dir()]
+    failures.sort(key=lambda failure: failure["name"])
+    if not drawn:
+        first = failures[0]
+        raise MissingInput(
+            f"none of {len(places)} objects could be rendered; {first['name']}: {first['reason']}",
+            first["hint"],
+        )
+    if failures:
+        tell(Warned(f"{len(failures)} of {len(places)} objects failed; failures.json says why"))
+    records = [json.loads((folder / place / "object.json").read_text()) | {"folder": place} for place in drawn]
+    (folder / "index.json").write_text(json.dumps({"objects": records}, indent=1) + "\n")
+    (folder / "failures.json").write_text(json.dumps(failures, indent=1) + "\n")
+    chosen = drawn[:: max(1, -(-len(drawn) // SHEET_OBJECTS))]
+    first_view = [sorted((folder / place / "color").iterdir()) for place in chosen]
+    names = [next((p for p in pictures if p.stem == "front"), pictures[0]) for pictures in first_view]
+    write_png(folder / "sheet.png", sheet_of_objects([read_image(path) for path in names]))
