@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
+import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from mv3d_cli.errors import WorkFailed
@@ -35,6 +40,7 @@ def map_items(
     initializer  called once in each worker process
 
     An exception is the item's outcome, and so is the death of its worker (WorkFailed): the other items go on.
+    An item whose worker died may have been done already when it is tried again.
     """
     if jobs == 1 or len(items) < 2:
         for item in items:
@@ -59,20 +65,62 @@ def _in_pool(
     """Outcomes of all items but those in flight when a worker died, which it returns; a new pool takes the rest."""
     waiting, suspects = list(reversed(items)), []
     while waiting:
-        context = multiprocessing.get_context("spawn")
-        pool = ProcessPoolExecutor(min(jobs, len(waiting)), mp_context=context, initializer=initializer)
+        pool = _pool(min(jobs, len(waiting)), initializer)
         flying: dict[Future[Outcome], Any] = {}
         try:
             while waiting or flying:
                 while waiting and len(flying) < jobs * AHEAD:
-                    item = waiting.pop()
-                    flying[pool.submit(_attempt, function, item)] = item
+                    flying[_submitted(pool, function, waiting[-1])] = waiting[-1]
+                    waiting.pop()
                 for future in wait(flying, return_when=FIRST_COMPLETED).done:
                     outcome = future.result()
                     del flying[future]
                     yield outcome
         except BrokenProcessPool:
-            suspects += flying.values()
+            pool.shutdown()  # from here on every future is settled
+            suspects += [item for future, item in flying.items() if future.exception()]
+            yield from [future.result() for future in flying if not future.exception()]
+        except BaseException:  # interrupted, or nobody wants the rest
+            for worker in (pool._processes or {}).values():
+                worker.terminate()
+            raise
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
     return suspects
+
+
+def _pool(jobs: int, initializer: Callable[[], None] | None) -> ProcessPoolExecutor:
+    context = multiprocessing.get_context("spawn")
+    return ProcessPoolExecutor(jobs, mp_context=context, initializer=partial(_start_worker, initializer))
+
+
+def _submitted(pool: ProcessPoolExecutor, function: Callable[[Any], Any], item: Any) -> Future[Outcome]:
+    with _interrupts_held():  # a worker that this starts inherits it: Ctrl-C is for the parent, which ends them
+        return pool.submit(_attempt, function, item)
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Ctrl-C waits until the end of the block."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _start_worker(initializer: Callable[[], None] | None) -> None:
+    threading.Thread(target=_leave_with_parent, daemon=True).start()
+    if initializer is not None:
+        initializer()
+
+
+def _leave_with_parent() -> None:
+    """Ends this worker when its parent is gone, however it went: nobody would read what it makes."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

@@ -5,6 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from trimesh.exchange.ply import export_ply
+from trimesh.visual import ColorVisuals
 
 from mv3d_cli.errors import BadMesh, MissingInput
 from mv3d_cli.formats.meshes import MeshFile, find_meshes, mesh_sources, read_mesh
@@ -92,7 +94,7 @@ def box() -> trimesh.Trimesh:
 def test_ply_and_stl(tmp_path, box, suffix, kind):
     path = tmp_path / f"a{suffix}"
     if kind == "ply_ascii":
-        path.write_bytes(trimesh.exchange.ply.export_ply(box, encoding="ascii"))
+        path.write_bytes(export_ply(box, encoding="ascii"))
     else:
         box.export(path, file_type=kind)
     mesh = read_mesh(MeshFile("a", path))
@@ -103,10 +105,18 @@ def test_ply_and_stl(tmp_path, box, suffix, kind):
     assert mesh_sources(MeshFile("a", path)) == [path]
 
 
+def test_all_solids_of_an_stl_are_read(tmp_path):
+    facet = "facet normal 0 0 1\nouter loop\nvertex 0 0 {z}\nvertex 1 0 {z}\nvertex 1 1 {z}\nendloop\nendfacet\n"
+    solids = [f"solid a\n{facet.format(z=z)}endsolid a\n" for z in (0, 5)]
+    (tmp_path / "a.stl").write_text("".join(solids))
+    mesh = read_mesh(MeshFile("a", tmp_path / "a.stl"))
+    assert mesh.vertices[mesh.faces][:, 0, 2].tolist() == [0, 5]
+
+
 @pytest.mark.parametrize("of", ["vertices", "faces"])
 def test_ply_colours_become_linear(tmp_path, box, of):
     colors = np.random.default_rng(0).integers(0, 255, (len(getattr(box, of)), 4), np.uint8)
-    box.visual = trimesh.visual.ColorVisuals(box, **{"vertex_colors" if of == "vertices" else "face_colors": colors})
+    box.visual = ColorVisuals(box, **{"vertex_colors" if of == "vertices" else "face_colors": colors})
     box.export(tmp_path / "a.ply")
     mesh = read_mesh(MeshFile("a", tmp_path / "a.ply"))
     assert mesh.colors is not None

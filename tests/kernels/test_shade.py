@@ -62,6 +62,18 @@ def test_uv_outside_the_texture_wrap(wrap: Wrap, index: np.ndarray) -> None:
     assert np.abs(color.astype(int) - texture.pixels[np.ix_(index, index)]).max() <= 1
 
 
+def test_each_face_has_its_own_material() -> None:
+    half = quad(Material()).vertices * 0.5
+    vertices = np.concatenate([half - [0.5, 0, 0], half + [0.5, 0, 0]]).astype(np.float32)
+    faces = np.array([[0, 2, 1], [0, 3, 2], [4, 6, 5], [4, 7, 6]], np.int32)
+    red, green = Material(base_color=(1.0, 0.0, 0.0, 1.0)), Material(base_color=(0.0, 1.0, 0.0, 1.0))
+    mesh = Mesh(vertices, faces, np.array([0, 0, 1, 1], np.int32), (red, green))
+    color = render(mesh, [FRONT], 16, None).frames[0].color
+    assert color is not None
+    assert (color[8, 2] == [255, 0, 0, 255]).all()
+    assert (color[8, 13] == [0, 255, 0, 255]).all()
+
+
 def test_base_color_and_vertex_colors_multiply_in_linear_light() -> None:
     mesh = quad(Material(base_color=(0.5, 0.25, 1.0, 1.0)))
     colors = np.full((4, 4), 0.5, np.float32)

@@ -37,10 +37,10 @@ def add_mesh(bpy: Any, mesh: Mesh, light: Light | None) -> None:
         data.materials.append(_material(bpy, mesh, material, light, images))
     data.polygons.foreach_set("material_index", np.ascontiguousarray(face_material, np.int32))
     if mesh.uvs is not None:
-        uvs = mesh.uvs[faces.ravel()] * np.float32([1, -1]) + np.float32([0, 1])
+        uvs = mesh.uvs[faces.ravel()] * np.array([1, -1], np.float32) + np.array([0, 1], np.float32)
         data.uv_layers.new(name="uv").data.foreach_set("uv", uvs.ravel())
     if mesh.colors is not None:
-        colors = data.color_attributes.new("color", "FLOAT_COLOR", "POINT")
+        colors = data.color_attributes.new("paint", "FLOAT_COLOR", "POINT")
         colors.data.foreach_set("color", mesh.colors.ravel())
     data.update(calc_edges=True)
     if mesh.normals is not None:
@@ -114,7 +114,7 @@ def _albedo(nodes: Any, links: Any, mesh: Mesh, material: Material, picture: Any
     color = factor.outputs[0]
     if mesh.colors is not None:
         vertex_color = nodes.new("ShaderNodeVertexColor")
-        vertex_color.layer_name = "color"
+        vertex_color.layer_name = "paint"
         color = _product(nodes, links, color, vertex_color.outputs["Color"])
     if picture is not None:
         color = _product(nodes, links, color, picture.outputs["Color"])

@@ -76,10 +76,9 @@ def _page(rows: Sequence[Sequence[Picture]]) -> Picture:
 
 def sheet_of_views(views: Views) -> Picture:
     """One column a view: colour, normals and depth, as far as the views hold them."""
-    surface = [view.depth[view.depth > 0] for view in views.frames if view.depth is not None]
-    known = [depths for depths in surface if depths.size]
-    near = float(min((depths.min() for depths in known), default=0.0))
-    far = float(max((depths.max() for depths in known), default=1.0))
+    depths = [view.depth for view in views.frames if view.depth is not None]
+    near = float(min((depth.min(where=depth > 0, initial=np.inf) for depth in depths), default=0.0))
+    far = float(max((depth.max() for depth in depths), default=1.0))
     rows = [
         [color_cell(view.color) for view in views.frames if view.color is not None],
         [normal_cell(view) for view in views.frames if view.normal is not None],

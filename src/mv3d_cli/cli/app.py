@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import os
 import signal
 import sys
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 import typer
@@ -22,7 +24,7 @@ COMMANDS = {
 }
 
 
-UsageProblem: type[Exception] = typer.BadParameter.__bases__[0]  # what a command line that does not parse raises
+UsageProblem: Any = typer.BadParameter.__bases__[0]  # what a command line that does not parse raises
 
 
 class LazyGroup(TyperGroup):
@@ -40,6 +42,11 @@ class LazyGroup(TyperGroup):
         command = get_command(module.app)
         command.name = cmd_name
         return command
+
+    def resolve_command(self, ctx: typer.Context, args: list[str]) -> Any:  # type: ignore[override]
+        if args[0] not in COMMANDS and not args[0].startswith("-") and not ctx.resilient_parsing:
+            raise UsageError(f"there is no command {args[0]}", _guess(args[0], [*COMMANDS], "see `mv3d --help`"))
+        return super().resolve_command(ctx, args)  # type: ignore[arg-type]
 
 
 app = typer.Typer(cls=LazyGroup, add_completion=True)
@@ -66,41 +73,56 @@ def main() -> None:
     signal.signal(signal.SIGTERM, _interrupt)
     debug = "--debug" in sys.argv
     words = [word for word in sys.argv[1:] if word != "--debug"]  # it may stand anywhere
-    sys.argv[1:] = words or ["--help"]
+    completing = "_MV3D_COMPLETE" in os.environ
+    sys.argv[1:] = words or ([] if completing else ["--help"])
     try:
         code = app(standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
-    except (Mv3dError, UsageProblem, OSError, MemoryError) as error:
+    except (KeyboardInterrupt, typer.Abort):
+        sys.exit(130)
+    except Exception as error:
         if debug:
             raise
         sys.exit(_explain(error))
-    except (KeyboardInterrupt, typer.Abort):
-        sys.exit(130)
 
 
 def _interrupt(signum: int, frame: object) -> None:
     raise KeyboardInterrupt
 
 
-def _explain(error: BaseException) -> int:
+def _explain(error: Exception) -> int:
     """Prints an error as one line and a hint; returns its exit code."""
     from mv3d_cli.cli.console import show_error
 
     if isinstance(error, BrokenPipeError):  # the reader of our stdout left: nobody to tell
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         return 1
+    told = _in_our_words(error)
+    show_error(told)
+    return told.exit_code
+
+
+def _in_our_words(error: Any) -> Mv3dError:
+    """The error, as one of ours."""
+    if isinstance(error, Mv3dError):
+        return error
     if isinstance(error, UsageProblem):
-        message = getattr(error, "format_message", lambda: str(error))()
-        error = UsageError(message, f"see `{_command_line(error)} --help`")
-    elif isinstance(error, OSError):
-        error = WorkFailed(f"{error.strerror or error}: {error.filename or ''}", "see the whole story with --debug")
-    elif isinstance(error, MemoryError):
-        error = WorkFailed("there is not enough memory", "take a smaller --size, or fewer --jobs")
-    assert isinstance(error, Mv3dError)
-    show_error(error)
-    return error.exit_code
+        context = getattr(error, "ctx", None)
+        page = f"see `{context.command_path if context is not None else 'mv3d'} --help`"
+        options = getattr(error, "possibilities", None)
+        if options:
+            return UsageError(error.message, _guess(error.option_name, options, page))
+        return UsageError(error.format_message(), page)
+    if isinstance(error, OSError):
+        place = f": {error.filename}" if error.filename else ""
+        return WorkFailed(f"{error.strerror or error}{place}", "see the whole story with --debug")
+    if isinstance(error, MemoryError):
+        return WorkFailed("there is not enough memory", "take a smaller --size, or fewer --jobs")
+    reason = f"a fault of mv3d itself ({type(error).__name__}: {error})"
+    return WorkFailed(reason, "please report it with what the same command prints with --debug")
 
 
-def _command_line(error: BaseException) -> str:
-    context = getattr(error, "ctx", None)
-    return context.command_path if context is not None else "mv3d"
+def _guess(word: str, known: Sequence[str], otherwise: str) -> str:
+    """The hint for a word that is not known."""
+    close = difflib.get_close_matches(word, known, n=1)
+    return f"did you mean {close[0]}? {otherwise}" if close else otherwise

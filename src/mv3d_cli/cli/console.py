@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bar
+from rich.text import Text
 
 from mv3d_cli.errors import Mv3dError, UsageError
 from mv3d_cli.steps.settings import Progress, Tell, Warned
@@ -23,11 +24,12 @@ stderr = Console(stderr=True, soft_wrap=True, highlight=False)
 
 def show_error(error: Mv3dError) -> None:
     """One line that says what is wrong, one that says what to do."""
-    stderr.print(f"[bold red]error:[/] {_plain(error)}", f"[bold]hint:[/] {_plain(error.hint)}", sep="\n")
+    _print("error:", "bold red", str(error))
+    _print("hint:", "bold", error.hint)
 
 
 def warn(text: str) -> None:
-    stderr.print(f"[yellow]warning:[/] {_plain(text)}")
+    _print("warning:", "yellow", text)
 
 
 def show_result(artifact: Artifact, output: Path | None, as_json: bool) -> None:
@@ -37,8 +39,9 @@ def show_result(artifact: Artifact, output: Path | None, as_json: bool) -> None:
     print(json.dumps(manifest, indent=2, sort_keys=True) if as_json else path, flush=True)
 
 
-def _plain(text: object) -> str:
-    return str(text).replace("[", "\\[")
+def _print(label: str, style: str, text: str) -> None:
+    """One line, in which nothing is markup: it may name any file."""
+    stderr.print(Text.assemble((label, style), " ", " ".join(text.split())))
 
 
 @contextmanager
@@ -63,7 +66,8 @@ def progress_bar() -> Iterator[Tell]:
     try:
         yield tell
     finally:
-        bar.stop()
+        if bar.live.is_started:  # or it would print an empty line
+            bar.stop()
 
 
 def path_from_stdin() -> Path:

@@ -27,7 +27,7 @@ def inputs_from(names: Sequence[str]) -> list[Path]:
 def _option(setting: Setting) -> inspect.Parameter:
     """The keyword parameter that Typer turns into a setting's option."""
     doc, bounds = setting.mark(Doc), setting.mark(Between)
-    text = doc.text + (f" [{bounds.least:g} to {bounds.most:g}]" if bounds else "")
+    text = doc.text + (f" [{bounds}]" if bounds else "")
     names = [setting.option, f"-{doc.short}"] if doc.short else [setting.option]
     kind, default = setting.kind, setting.default
     if kind == tuple[str, ...]:

@@ -62,6 +62,8 @@ def select(cameras: Sequence[Camera], names: Iterable[str]) -> tuple[Camera, ...
             close = difflib.get_close_matches(name, by_name, n=1)
             guess = f"Did you mean {close[0]}? " if close else ""
             raise BadCameras(f"there is no view called {name}.", f"{guess}There are: {', '.join(by_name)}.")
+        if any(name == camera.name for camera in chosen):
+            raise BadCameras(f"the view {name} is asked for twice.", "Name each view once.")
         chosen.append(by_name[name])
     return tuple(chosen)
 

@@ -61,8 +61,7 @@ def find_meshes(path: Path) -> list[MeshFile]:
     files = list(_files_below(path))
     if not files:
         raise MissingInput(f"there is no mesh in {path}.", _HINT)
-    root = path.resolve().name
-    stems = {file: _name_below(path, file, root) for file in files}
+    stems = {file: _name_below(path, file) for file in files}
     shared = Counter(name.casefold() for name in stems.values())
     named = [(f"{n}_{f.suffix[1:]}" if shared[n.casefold()] > 1 else n, f) for f, n in stems.items()]
     taken: set[str] = set()
@@ -187,7 +186,10 @@ def _read_ply(path: Path) -> Mesh:
 
     check_readable(path)
     with path.open("rb") as stream:
-        read: dict[str, Any] = load_ply(stream, fix_texture=False, skip_materials=True)
+        try:
+            read: dict[str, Any] = load_ply(stream, fix_texture=False, skip_materials=True)
+        except OSError as error:  # it seeks to wherever the header says
+            raise BadMesh(f"it is truncated or damaged: {error}.", "Copy or export the file again.") from error
     faces = read.get("faces")
     if faces is None or not len(faces):
         raise BadMesh("it has no face; points and lines have no surface.", "Give a mesh of triangles.")
@@ -214,14 +216,16 @@ def _read_ply(path: Path) -> Mesh:
 
 
 def _read_stl(path: Path) -> Mesh:
-    import trimesh
+    from trimesh.exchange.stl import load_stl
 
     check_readable(path)
     with path.open("rb") as stream:
-        read = trimesh.load_mesh(stream, file_type="stl", process=False)
-    if not len(getattr(read, "faces", ())):
+        read: dict[str, Any] = load_stl(stream)
+    solids = list(read["geometry"].values()) if "geometry" in read else [read]
+    if not solids:
         raise BadMesh("it has no face.", "Give a mesh of triangles.")
-    return _plain_mesh(np.asarray(read.vertices), np.asarray(read.faces))
+    vertices = np.concatenate([solid["vertices"] for solid in solids])
+    return _plain_mesh(vertices, np.arange(len(vertices)).reshape(-1, 3))
 
 
 def _plain_mesh(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
@@ -251,15 +255,14 @@ def _files_below(folder: Path) -> Iterator[Path]:
                 yield Path(parent, name)
 
 
-def _name_below(root: Path, file: Path, root_name: str) -> str:
-    if _is_scanned(file) and _object_folder(file) != root:
-        parts = Path(os.path.relpath(_object_folder(file), root)).parts
-        named = [part for part in parts if part not in (".", "..")]
-    elif _is_scanned(file):
-        named = []
+def _name_below(root: Path, file: Path) -> str:
+    if _is_scanned(file):
+        place = _object_folder(file)
+        below = Path(os.path.relpath(place, root)).parts
+        named = list(below) if below and below[0] != ".." else [place.name]
     else:
         named = [*file.relative_to(root).parts[:-1], file.stem]
-    return _plain("__".join(named) or root_name)
+    return _plain("__".join(named))
 
 
 def _plain(name: str) -> str:

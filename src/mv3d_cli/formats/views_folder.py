@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -24,7 +25,7 @@ from mv3d_cli.scene.views import Source, View, Views
 TRANSFORMS = "transforms.json"
 _HINT = "A views folder holds transforms.json and the pictures it names; `mv3d render` writes one."
 _FILE_KEYS = {"color": "file_path", "depth": "depth_file_path", "normal": "normal_file_path"}
-_THREADS = 8
+_THREADS = min(8, os.cpu_count() or 1)
 
 
 def write_views(folder: Path, views: Views, *, color: bool = True, depth: bool = True, normal: bool = True) -> None:

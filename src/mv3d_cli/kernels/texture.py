@@ -28,6 +28,8 @@ class Texels:
 @wp.func
 def wrapped(i: int, size: int, mode: int) -> int:
     """A texel's index brought into the texture."""
+    if i >= 0 and i < size:
+        return i
     if mode == CLAMP:
         return wp.clamp(i, 0, size - 1)
     if mode == REPEAT:
@@ -46,7 +48,7 @@ def texel(t: Texels, offset: int, index: int) -> wp.vec4:
         t.linear[int(word & wp.uint32(255))],
         t.linear[int((word >> wp.uint32(8)) & wp.uint32(255))],
         t.linear[int((word >> wp.uint32(16)) & wp.uint32(255))],
-        float(word >> wp.uint32(24)) / 255.0,
+        float(word >> wp.uint32(24)) * (1.0 / 255.0),
     )
 
 
@@ -86,12 +88,15 @@ def sample(t: Texels, texture: int, uv: wp.vec2, along_x: wp.vec2, along_y: wp.v
     taps = wp.clamp(int(major / wp.max(minor, 1.0) + 0.5), 1, 4)
     lod = wp.clamp(wp.log2(wp.max(major / float(taps), 1.0e-6)), 0.0, float(page[1] - 1))
     level = int(lod)
-    blend = lod - float(level)
+    blend = wp.clamp(2.0 * (lod - float(level)) - 0.5, 0.0, 1.0)  # close to a level, that level alone
+    if blend == 1.0:
+        level = wp.min(level + 1, page[1] - 1)
+        blend = 0.0
     total = wp.vec4()
     for k in range(taps):
         place = uv + longer * ((float(k) + 0.5) / float(taps) - 0.5)
         color = sample_level(t, page, level, place)
-        if blend > 0.01:
+        if blend > 0.0:
             color = wp.lerp(color, sample_level(t, page, wp.min(level + 1, page[1] - 1), place), blend)
         total += color
     return total / float(taps)

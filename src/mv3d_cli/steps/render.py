@@ -19,6 +19,7 @@ VERSION = 1  # bumped when the same settings and inputs give other bytes
 
 Lighting = Literal["random", "studio", "none"]
 Engine = Literal["raster", "blender"]
+Device = Literal["cpu", "cuda"]
 Up = Literal["auto", "y", "z"]
 
 
@@ -38,7 +39,7 @@ class Config:
     engine: Annotated[Engine, Doc("Our rasteriser, or Blender Cycles (extra: blender).")] = "raster"
     samples: Annotated[int, Doc("Cycles samples a pixel."), Between(1, 4096)] = 32
     jobs: Annotated[int, Doc("Worker processes of a batch; 0: one per processor."), Between(0, 256), Runtime()] = 0
-    device: Annotated[str, Doc("cpu or cuda."), Runtime()] = "cpu"
+    device: Annotated[Device, Doc("Where the rasteriser runs."), Runtime()] = "cpu"
 
 
 def run(config: Config, inputs: Sequence[Path], tell: Tell = silent) -> Artifact:
@@ -49,16 +50,17 @@ def run(config: Config, inputs: Sequence[Path], tell: Tell = silent) -> Artifact
     check(config)
     from mv3d_cli.steps import render_objects as objects
 
+    objects.check_device(config)
     rig = objects.rig_of(config)
     work = objects.work_of(config, inputs)
     digests = {item.label: item.digest for item in work}
     if config.cameras is not None:
         digests["cameras"] = digest_of_file(config.cameras)
     sources = {item.label: str(item.source) for item in work if item.source is not None}
-    recipe = Recipe("render", VERSION, key_config(config), digests, sources=sources)
-    batch = len(work) > 1 or config.rotations > 0 or objects.is_batch(inputs)
-    if not batch:
-        build = partial(objects.render_one, config, rig, work[0], tell=tell)
-    else:
+    batch = objects.is_batch(config, inputs)
+    recipe = Recipe("render", VERSION, key_config(config) | {"batch": batch}, digests, sources=sources)
+    if batch:
         build = partial(objects.render_all, config, rig, work, tell=tell)
-    return produce(recipe, build, resumable=batch, on_notice=lambda text: tell(Warned(text)))
+    else:
+        build = partial(objects.render_one, config, rig, work[0], tell=tell)
+    return produce(recipe, build, resumable=batch, device=config.device, on_notice=lambda text: tell(Warned(text)))

@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import warp
 from jaxtyping import Float
 
 from mv3d_cli.capture.lighting import light_for
 from mv3d_cli.capture.rendering import render
 from mv3d_cli.capture.shapes import procedural_mesh
 from mv3d_cli.capture.sheet import sheet_of_objects, sheet_of_views
-from mv3d_cli.errors import BadMesh, MissingInput, Mv3dError, UsageError
+from mv3d_cli.errors import BadMesh, InputError, MissingDependency, MissingInput, Mv3dError, UsageError
 from mv3d_cli.formats.cameras import load_cameras, select
 from mv3d_cli.formats.images import read_image, write_png
 from mv3d_cli.formats.meshes import MeshFile, find_meshes, mesh_sources, read_mesh
@@ -32,13 +33,15 @@ from mv3d_cli.scene.views import Views
 from mv3d_cli.steps.render import Config
 from mv3d_cli.steps.settings import Progress, Tell, Warned
 from mv3d_cli.store import digest_of_file
+from mv3d_cli.store.disk import ran_out_of_space
 
 SHEET_OBJECTS = 64
+OUR_FILES = ("index.json", "failures.json", "sheet.png", "artifact.json")  # in a data-set folder, beside the objects
 
 
 @dataclass(frozen=True)
 class Object:
-    """One thing to draw: a mesh file, or a procedural seed; `turn` counts its random turns (None: as it stands)."""
+    """One thing to draw: a mesh file, or a procedural seed."""
 
     name: str
     digest: str
@@ -60,9 +63,17 @@ def rig_of(config: Config) -> tuple[Camera, ...]:
     return select(rig, config.views) if config.views else rig
 
 
-def is_batch(inputs: Sequence[Path]) -> bool:
-    """Whether the inputs ask for a data set even if they hold one object only: a folder that is not itself one."""
-    return any(path.is_dir() and find_meshes(path)[0].path.parent.parent != path for path in inputs)
+def check_device(config: Config) -> None:
+    """Raises UsageError for a device that is not here."""
+    if config.device == "cuda" and not warp.is_cuda_available():
+        raise UsageError("--device cuda: there is no CUDA device here", "leave it out to render on the processor")
+
+
+def is_batch(config: Config, inputs: Sequence[Path]) -> bool:
+    """Whether a data set is wanted, if only of one object. A scanned object's folder counts as one mesh."""
+    folders = [path for path in inputs if path.is_dir()]
+    several = len(inputs) > 1 or config.rotations > 0 or config.procedural > 0
+    return several or any(find_meshes(path)[0].path != path / "meshes" / "model.obj" for path in folders)
 
 
 def work_of(config: Config, inputs: Sequence[Path]) -> list[Object]:
@@ -70,31 +81,36 @@ def work_of(config: Config, inputs: Sequence[Path]) -> list[Object]:
     if not inputs and not config.procedural:
         raise UsageError("there is nothing to render", "give a mesh, a folder of meshes, or --procedural N")
     files = [file for path in inputs for file in find_meshes(path)]
-    found = [
-        Object(name, _digest(file), file) for name, file in zip(_unique(f.name for f in files), files, strict=True)
+    seeds = [config.seed * 1_000_003 + i for i in range(config.procedural)]
+    names = _unique([*(file.name for file in files), *(f"procedural_{i:06d}" for i in range(config.procedural))])
+    found = [Object(name, _digest(file), file) for name, file in zip(names, files, strict=False)]
+    return found + [
+        Object(name, f"procedural:{seed}", seed=seed) for name, seed in zip(names[len(files) :], seeds, strict=True)
     ]
-    made = [config.seed * 1_000_003 + i for i in range(config.procedural)]
-    return found + [Object(f"procedural_{i:06d}", f"procedural:{seed}", seed=seed) for i, seed in enumerate(made)]
 
 
 def _unique(names: Iterable[str]) -> list[str]:
-    """The names, those met before numbered."""
-    taken: set[str] = set()
+    """The names, those met before numbered, also where a file system takes small and capital letters for the same."""
+    taken: set[str] = {*OUR_FILES}
     result = []
     for name in names:
         candidate, n = name, 1
-        while candidate in taken:
+        while candidate.casefold() in taken:
             n += 1
             candidate = f"{name}_{n}"
-        taken.add(candidate)
+        taken.add(candidate.casefold())
         result.append(candidate)
     return result
 
 
 def _digest(file: MeshFile) -> str:
-    """sha256 over all files that a mesh is read from; a missing or unreadable one counts as such."""
+    """sha256 over all files that a mesh is read from; one that cannot be read is told of when it is drawn."""
+    try:
+        sources = mesh_sources(file)
+    except InputError:
+        sources = [file.path]
     total = hashlib.sha256()
-    for path in mesh_sources(file):
+    for path in sources:
         total.update(path.name.encode() + b"\0")
         total.update(digest_of_file(path).encode() if path.is_file() else b"missing")
     return total.hexdigest()
@@ -113,8 +129,7 @@ def render_all(config: Config, rig: Sequence[Camera], work: Sequence[Object], fo
     turns = list(range(config.rotations)) if config.rotations else [None]
     places = {_place(item, turn): (item, turn) for item in work for turn in turns}
     waiting = [place for place in places if not (folder / place).is_dir()]
-    for leftover in folder.glob(".partial-*"):
-        shutil.rmtree(leftover)
+    _sweep(folder)
     jobs = min(config.jobs or cpu_count(), len(waiting))
     todo = [(place, *places[place]) for place in waiting]
     failures, done = [], len(places) - len(waiting)
@@ -122,9 +137,23 @@ def render_all(config: Config, rig: Sequence[Camera], work: Sequence[Object], fo
     for outcome in map_items(draw, todo, max(jobs, 1), partial(use_threads, 1)):
         done += 1
         if outcome.error is not None:
+            if _concerns_all(outcome.error):
+                raise outcome.error
             failures.append(_failure(outcome))
         tell(Progress(done, len(places), "objects"))
+    _sweep(folder)
     _finish(folder, places, failures, tell)
+
+
+def _sweep(folder: Path) -> None:
+    """Removes what workers that were killed left half drawn."""
+    for leftover in folder.glob(".partial-*"):
+        shutil.rmtree(leftover)
+
+
+def _concerns_all(error: Exception) -> bool:
+    """Whether an object failed for a reason that is not its own: a full disk, a package that is missing."""
+    return isinstance(error, MissingDependency) or ran_out_of_space(error)
 
 
 def _place(item: Object, turn: int | None) -> str:
@@ -132,8 +161,10 @@ def _place(item: Object, turn: int | None) -> str:
 
 
 def _draw_into(config: Config, rig: tuple[Camera, ...], folder: Path, todo: tuple[str, Object, int | None]) -> None:
-    """One object of a batch, written beside its place and renamed into it."""
+    """One object of a batch, written beside its place and renamed into it; nothing to do where it is done."""
     place, item, turn = todo
+    if (folder / place).is_dir():
+        return
     partial_folder = folder / f".partial-{place}"
     try:
         _draw(config, rig, item, turn, partial_folder)

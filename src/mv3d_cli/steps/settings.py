@@ -31,6 +31,9 @@ class Between:
     least: float
     most: float
 
+    def __str__(self) -> str:
+        return f"{self.least:,} to {self.most:,}".replace(",", " ")
+
 
 @dataclass(frozen=True)
 class Runtime:
@@ -100,7 +103,7 @@ def check(config: Any) -> None:
         if bounds is not None and value is not None and not bounds.least <= value <= bounds.most:
             raise UsageError(
                 f"{setting.option} {value} is out of range",
-                f"take a value from {bounds.least:g} to {bounds.most:g}",
+                f"take a value from {bounds}",
             )
         if get_origin(setting.kind) is Literal and value not in get_args(setting.kind):
             choices = ", ".join(map(str, get_args(setting.kind)))

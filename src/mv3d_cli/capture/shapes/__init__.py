@@ -37,7 +37,7 @@ def procedural_parts(seed: int) -> list[Part]:
     rng = np.random.default_rng(seed)
     families, weights = zip(*FAMILIES, strict=True)
     parts = _centred(pick(rng, families, weights)(rng))
-    return _varied(rng, [*parts, *_badges(rng, parts)] if chance(rng, 0.2) else parts)
+    return _varied(rng, [*parts, *_badges(rng, parts)] if chance(rng, 0.12) else parts)
 
 
 def _centred(parts: list[Part]) -> list[Part]:

@@ -33,6 +33,8 @@ def primitive(document: Document, item: dict[str, Any], surface: Surface) -> Pri
     attributes, corners = _attributes(document, item)
     positions = attributes["POSITION"]
     count = len(positions)
+    if not np.isfinite(positions).all():
+        raise document.bad("it has vertices that are not finite")
     faces = _triangles(mode, np.arange(count) if corners is None else corners)
     if faces.size and (faces.max() >= count or faces.min() < 0):
         raise document.bad(f"a face refers to vertex {faces.max()} of {count}")

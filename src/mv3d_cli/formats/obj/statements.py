@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import BinaryIO
+from io import BufferedIOBase
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32, Int64, UInt8
@@ -49,7 +49,7 @@ class _Reading:
     material: int = -1
 
 
-def read_statements(stream: BinaryIO) -> Statements:
+def read_statements(stream: BufferedIOBase) -> Statements:
     """Parse an OBJ file; polygons become fans. Raises BadMesh, without saying which file."""
     reading = _Reading({kind: [] for kind in (*_KINDS, "rgb", "material")}, dict.fromkeys(_KINDS, 0), {}, [])
     for piece in _pieces(stream):
@@ -68,13 +68,13 @@ def read_statements(stream: BinaryIO) -> Statements:
     )
 
 
-def library_names(stream: BinaryIO) -> list[str]:
+def library_names(stream: BufferedIOBase) -> list[str]:
     """The arguments of the `mtllib` lines."""
     found = (re.findall(rb"(?m)^[ \t]*mtllib[ \t]+([^\r\n]*)", piece) for piece in _pieces(stream))
     return [name.decode("utf-8", errors="replace").strip() for names in found for name in names]
 
 
-def _pieces(stream: BinaryIO) -> Iterator[bytes]:
+def _pieces(stream: BufferedIOBase) -> Iterator[bytes]:
     """The file in pieces of whole lines that end in a newline, continued lines together."""
     rest = b""
     while chunk := stream.read(_BLOCK):

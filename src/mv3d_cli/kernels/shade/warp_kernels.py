@@ -132,9 +132,8 @@ def lit(lights: Lights, albedo: wp.vec3, gloss: float, point: wp.vec3, n: wp.vec
 
 
 @wp.func
-def albedo_at(surface: Surface, index: int, corners: wp.vec3i, b: wp.vec3, bx: wp.vec3, by: wp.vec3) -> wp.vec3:
+def albedo_at(surface: Surface, material: int, corners: wp.vec3i, b: wp.vec3, bx: wp.vec3, by: wp.vec3) -> wp.vec3:
     """Linear albedo at barycentrics `b`; `bx`, `by` are the barycentrics one pixel to the right and below."""
-    material = surface.face_material[index]
     factor = surface.base_color[material]
     color = wp.vec3(factor[0], factor[1], factor[2])
     if surface.colors.shape[0] > 0:
@@ -214,10 +213,40 @@ def packed(codes: wp.array(dtype=wp.uint8), color: wp.vec3, alpha: float) -> wp.
     return word | (wp.uint32(alpha * 255.0 + 0.5) << wp.uint32(24))
 
 
+@wp.func
+def pixel_at(
+    eye: Eye,
+    vertices: wp.array(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    screen: wp.array(dtype=wp.vec3),
+    surface: Surface,
+    lights: Lights,
+    codes: wp.array(dtype=wp.uint8),
+    seen: wp.vec4i,
+    corner: wp.vec2,
+) -> wp.uint32:
+    """One pixel, of whose samples at least one shows a face; `corner` is its upper left, in samples."""
+    middle = corner + wp.vec2(1.0, 1.0)
+    total = wp.vec3()
+    covered = float(0.0)
+    k = int(0)
+    while k < 4:  # not a `for`, which Warp would unroll into four copies of the shading
+        if seen[k] >= 0:
+            centre = centre_of(seen, k)
+            if centre[2] > 0.0:
+                place = corner + wp.vec2(centre[0], centre[1])
+                shade = shade_at(eye, vertices, faces[seen[k]], screen, surface, lights, seen[k], middle, place)
+                total += shade * centre[2]
+                covered += centre[2]
+        k += 1
+    return packed(codes, total / covered, covered / 4.0)
+
+
 @wp.kernel
 def color(
     eyes: wp.array(dtype=Eye),
     view: int,
+    run: int,
     vertices: wp.array(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3i),
     screen: wp.array2d(dtype=wp.vec3),
@@ -227,38 +256,30 @@ def color(
     codes: wp.array(dtype=wp.uint8),
     out: wp.array2d(dtype=wp.uint32),
 ):
-    """Pixels, sRGB with straight alpha, from a z-buffer twice as fine."""
-    row, column = wp.tid()
+    """Pixels, sRGB with straight alpha, from a z-buffer twice as fine; a thread draws `run` of them in a row."""
+    row, part = wp.tid()
+    eye = eyes[view]
     upper = row * 2
-    left = column * 2
-    seen = wp.vec4i(
-        face_from(words[0, upper, left]),
-        face_from(words[0, upper, left + 1]),
-        face_from(words[0, upper + 1, left]),
-        face_from(words[0, upper + 1, left + 1]),
-    )
-    if wp.max(seen) < 0:
-        out[row, column] = wp.uint32(0)
-        return
-    middle = wp.vec2(float(left + 1), float(upper + 1))
-    total = wp.vec3()
-    covered = float(0.0)
-    for k in range(4):
-        if seen[k] >= 0:
-            centre = centre_of(seen, k)
-            if centre[2] > 0.0:
-                place = wp.vec2(float(left) + centre[0], float(upper) + centre[1])
-                corners = faces[seen[k]]
-                shade = shade_at(eyes[view], vertices, corners, screen[0], surface, lights, seen[k], middle, place)
-                total += shade * centre[2]
-                covered += centre[2]
-    out[row, column] = packed(codes, total / covered, covered / 4.0)
+    for column in range(part * run, wp.min((part + 1) * run, out.shape[1])):
+        left = column * 2
+        seen = wp.vec4i(
+            face_from(words[0, upper, left]),
+            face_from(words[0, upper, left + 1]),
+            face_from(words[0, upper + 1, left]),
+            face_from(words[0, upper + 1, left + 1]),
+        )
+        if wp.max(seen) < 0:
+            out[row, column] = wp.uint32(0)
+        else:
+            corner = wp.vec2(float(left), float(upper))
+            out[row, column] = pixel_at(eye, vertices, faces, screen[0], surface, lights, codes, seen, corner)
 
 
 @wp.kernel
 def geometry(
     eyes: wp.array(dtype=Eye),
     view: int,
+    run: int,
     vertices: wp.array(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3i),
     screen: wp.array2d(dtype=wp.vec3),
@@ -268,19 +289,21 @@ def geometry(
     normal_out: wp.array3d(dtype=wp.uint8),
 ):
     """Depth (0 = none) and normal bytes (128 = none) at pixel centres; normals in the viewer's axes."""
-    row, column = wp.tid()
-    word = words[0, row, column]
-    index = face_from(word)
-    n = wp.vec3()
-    depth = float(0.0)
-    if index >= 0:
-        depth = depth_from(word)
-        eye = eyes[view]
-        corners = faces[index]
-        b = barycentric_at(eye, vertices, corners, screen[0], wp.vec2(float(column) + 0.5, float(row) + 0.5))
-        world = normal_at(surface, vertices, corners, b, towards_eye(eye, point_at(vertices, corners, b)))
-        n = wp.vec3(eye.rotation * wp.vec3d(world))
-        n = wp.vec3(n[0], -n[1], -n[2])
-    depth_out[row, column] = depth
-    for i in range(3):
-        normal_out[row, column, i] = wp.uint8(int(wp.clamp((n[i] + 1.0) * 127.5 + 0.5, 0.0, 255.0)))
+    row, part = wp.tid()
+    eye = eyes[view]
+    for column in range(part * run, wp.min((part + 1) * run, depth_out.shape[1])):
+        word = words[0, row, column]
+        index = face_from(word)
+        n = wp.vec3()
+        if index >= 0:
+            corners = faces[index]
+            place = wp.vec2(float(column) + 0.5, float(row) + 0.5)
+            b = barycentric_at(eye, vertices, corners, screen[0], place)
+            world = normal_at(surface, vertices, corners, b, towards_eye(eye, point_at(vertices, corners, b)))
+            n = wp.vec3(eye.rotation * wp.vec3d(world))
+            n = wp.vec3(n[0], -n[1], -n[2])
+            depth_out[row, column] = depth_from(word)
+        else:
+            depth_out[row, column] = 0.0
+        for i in range(3):
+            normal_out[row, column, i] = wp.uint8(int(wp.clamp((n[i] + 1.0) * 127.5 + 0.5, 0.0, 255.0)))
