@@ -78,9 +78,7 @@ def test_made_once_then_found_with_its_whole_manifest():
     assert first.manifest["config"] == {"size": [1, 2]}
     assert first.manifest["versions"]["numpy"]
     assert store.open_artifact(first.path) == first
-    assert (
-        store.find_artifact(first.path / "sub") == store.find_artifact(first.path / "sub" / "b.txt") == first
-    )
+    assert store.find_artifact(first.path / "sub") == store.find_artifact(first.path / "sub" / "b.txt") == first
 
 
 def test_two_processes_do_the_work_once(tmp_path):
@@ -107,9 +105,7 @@ def test_killed_at_any_moment_leaves_a_whole_artifact_or_none(tmp_path, cache, r
     assert everything_in(cache) == {*(f"{part}.bin" for part in range(8)), "artifact.json"}
 
 
-@pytest.mark.parametrize(
-    "harm", ["flip", "shorten", "remove", "add", "manifest", "no manifest", "a file instead"]
-)
+@pytest.mark.parametrize("harm", ["flip", "shorten", "remove", "add", "manifest", "no manifest", "a file instead"])
 def test_damage_is_found_said_and_made_again(harm):
     made = produce(recipe(), writes(a_txt="hello", b_txt="world"))
     if harm in ("flip", "shorten"):

@@ -207,9 +207,7 @@ for _ in range(15):
 """
     for output in (tmp_path / "out" / "views", tmp_path / "out" / "mesh.glb"):
         racers = [
-            subprocess.Popen(
-                [sys.executable, "-c", script, str(each.path), str(output)], stderr=subprocess.PIPE
-            )
+            subprocess.Popen([sys.executable, "-c", script, str(each.path), str(output)], stderr=subprocess.PIPE)
             for each in made
         ]
         for racer in racers:

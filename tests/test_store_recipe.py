@@ -15,12 +15,8 @@ from hypothesis import strategies as st
 from mv3d_cli import errors, store
 from mv3d_cli.store import Recipe
 
-SCALARS = (
-    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text()
-)
-VALUES = st.recursive(
-    SCALARS, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=12
-)
+SCALARS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text()
+VALUES = st.recursive(SCALARS, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=12)
 
 
 @given(VALUES)
@@ -35,9 +31,7 @@ def test_canonical_json_is_json_of_the_same_value(value):
 def test_key_ignores_order_and_tuples_and_sees_every_value(config, chance):
     names = [*config]
     chance.shuffle(names)
-    shuffled = {
-        name: tuple(config[name]) if isinstance(config[name], list) else config[name] for name in names
-    }
+    shuffled = {name: tuple(config[name]) if isinstance(config[name], list) else config[name] for name in names}
     key = Recipe("paint", 1, config, {}).key
     assert Recipe("paint", 1, shuffled, {}, sources={"photo": "a.jpg"}).key == key
     assert Recipe("paint", 1, {**config, names[0]: [config[names[0]]]}, {}).key != key
@@ -46,8 +40,7 @@ def test_key_ignores_order_and_tuples_and_sees_every_value(config, chance):
 def test_key_is_the_same_for_ever_and_depends_on_each_part():
     first = Recipe("paint", 1, {"views": 8, "size": (2, 3.5)}, {"photo": "ab"})
     text = (
-        '{"config":{"size":[2,3.5],"views":8},"inputs":{"photo":"ab"},'
-        '"step":"paint","step_version":1,"weights":null}'
+        '{"config":{"size":[2,3.5],"views":8},"inputs":{"photo":"ab"},"step":"paint","step_version":1,"weights":null}'
     )
     assert first.key == hashlib.sha256(text.encode()).hexdigest()
     others = [

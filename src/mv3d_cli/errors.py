@@ -1,18 +1,18 @@
 """Every error a user can meet: one line that says what is wrong, one hint that says what to do.
 
-    Mv3dError                    the root; `str(error)` is the line, `error.hint` the advice
-    |- InputError       exit 2   what the user gave cannot be used
-    |  |- UsageError             a command line that does not parse, or a setting out of range
-    |  |- MissingInput           a path that is not there, or a folder without what we need
-    |  |- BadMesh                a mesh file that cannot be read, or holds no surface
-    |  |- BadImage               a picture that cannot be read
-    |  |- BadCameras             a cameras file that cannot be read, or a view that is not in it
-    |  |- BadViews               a views folder that cannot be read
-    |  `- OutputRefused          an output path that we cannot, or must not, write to
-    `- WorkFailed       exit 1   the input was fine and the work did not succeed
-       |- OutOfSpace             the disk is full, or a size limit was met
-       |- DamagedArtifact        an artifact whose bytes are not what its manifest says
-       `- MissingDependency      an optional package that this request needs
+Mv3dError                    the root; `str(error)` is the line, `error.hint` the advice
+|- InputError       exit 2   what the user gave cannot be used
+|  |- UsageError             a command line that does not parse, or a setting out of range
+|  |- MissingInput           a path that is not there, or a folder without what we need
+|  |- BadMesh                a mesh file that cannot be read, or holds no surface
+|  |- BadImage               a picture that cannot be read
+|  |- BadCameras             a cameras file that cannot be read, or a view that is not in it
+|  |- BadViews               a views folder that cannot be read
+|  `- OutputRefused          an output path that we cannot, or must not, write to
+`- WorkFailed       exit 1   the input was fine and the work did not succeed
+   |- OutOfSpace             the disk is full, or a size limit was met
+   |- DamagedArtifact        an artifact whose bytes are not what its manifest says
+   `- MissingDependency      an optional package that this request needs
 """
 
 from __future__ import annotations

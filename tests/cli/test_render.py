@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import resource
-import time
 from pathlib import Path
 
 import numpy as np
@@ -42,9 +41,7 @@ def test_stdout_is_the_path_of_a_views_folder(mv3d, ball):
     assert ran.stderr == ""
     files = [f"{kind}/{name}.{end}" for kind, end in zip(("color", "depth", "normal"), ("png", "exr", "png"), strict=True)
              for name in RIG]  # fmt: skip
-    assert sorted(inodes(ran.path)) == sorted(
-        [*files, "transforms.json", "object.json", "sheet.png", "artifact.json"]
-    )
+    assert sorted(inodes(ran.path)) == sorted([*files, "transforms.json", "object.json", "sheet.png", "artifact.json"])
     views = read_views(ran.path)
     assert [view.camera.name for view in views.frames] == RIG
     assert all(view.shape == (32, 32) for view in views.frames)
@@ -152,7 +149,18 @@ def test_lighting(mv3d, meshes):
 
 def test_same_seed_same_bytes(mv3d, ball, cache_folder):
     runs = [
-        mv3d("render", ball, *SMALL, "--rotations", 2, "--seed", seed, env={"MV3D_CACHE_DIR": str(cache_folder / name)})
+        mv3d(
+            "render",
+            ball,
+            *SMALL,
+            "--rotations",
+            2,
+            "--jobs",
+            1,
+            "--seed",
+            seed,
+            env={"MV3D_CACHE_DIR": str(cache_folder / name)},
+        )
         for name, seed in (("a", 7), ("b", 7), ("c", 8))
     ]
     a, b, c = (digest(ran.path) for ran in runs)
@@ -177,13 +185,3 @@ def test_a_full_disk_stops_a_batch(refused, mv3d, meshes, cache_folder):
         assert not [*cache_folder.rglob("artifact.json")]
     folder = mv3d("render", meshes, "--size", 64).path
     assert json.loads((folder / "failures.json").read_text()) == []
-
-
-def test_a_cache_hit_is_quick(mv3d, ball):
-    def seconds() -> float:
-        start = time.perf_counter()
-        mv3d("render", ball, "--size", 256)
-        return time.perf_counter() - start
-
-    drawn = seconds()
-    assert min(seconds() for _ in range(3)) < drawn

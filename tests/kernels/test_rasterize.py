@@ -33,7 +33,8 @@ def test_equals_the_torch_twin(camera: Camera, seed: int) -> None:
     ours = rasterize(torch.from_numpy(vertices), torch.from_numpy(faces), [camera], 48, 40)
     twin = reference.rasterize(torch.from_numpy(vertices), torch.from_numpy(faces), [camera], 48, 40)
     same = ours.face == twin.face
-    assert same.float().mean() > 0.995  # they may differ on edges and where faces cross
+    tie = (ours.depth - twin.depth).abs() < 1e-5  # where faces cross or coincide either may win
+    assert (same | tie).float().mean() > 0.995  # and they may differ on edges
     seen = same & (twin.face >= 0)
     assert seen.sum() > 100
     assert torch.allclose(ours.depth[seen], twin.depth[seen], atol=1e-4, rtol=1e-4)

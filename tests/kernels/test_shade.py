@@ -199,3 +199,20 @@ def test_random_lights_are_varied_and_not_blown_out() -> None:
     assert 100 < np.mean(means) < 250
     assert np.std(means) > 5
     assert (harmonics(np.eye(3)) @ studio().ambient > 0).all()
+
+
+@pytest.mark.cuda
+def test_cuda_draws_what_the_cpu_draws() -> None:
+    torch = pytest.importorskip("torch")
+    if not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+    mesh = quad(Material(texture=noise_texture(64)), repeat=1.7, tilt=0.4)
+    for light in (None, studio()):
+        host = render(mesh, [FRONT], 96, light).frames[0]
+        card = render(mesh, [FRONT], 96, light, device="cuda:0").frames[0]
+        assert host.color is not None
+        assert card.color is not None
+        assert host.depth is not None
+        assert card.depth is not None
+        assert np.abs(host.color.astype(int) - card.color).mean() < 0.5
+        assert np.abs(host.depth - card.depth).max() < 1e-4

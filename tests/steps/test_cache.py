@@ -27,9 +27,7 @@ def kept(tmp_path, monkeypatch) -> Path:
     return tmp_path / "kept"
 
 
-def made(
-    step: str, source: Path | None = None, size: int = 10, main: str | None = None, **config: object
-) -> Artifact:
+def made(step: str, source: Path | None = None, size: int = 10, main: str | None = None, **config: object) -> Artifact:
     sources = {"input": str(source)} if source else {}
     inputs = {"input": store.digest_of_path(source)} if source else {}
 
@@ -64,8 +62,7 @@ def chain(tmp_path: Path) -> tuple[Path, Path]:
 
 def told(reference: object) -> list[tuple[int, str | None, str | None]]:
     return [
-        (origin.depth, origin.step, origin.source and Path(origin.source).name)
-        for origin in cache.why(str(reference))
+        (origin.depth, origin.step, origin.source and Path(origin.source).name) for origin in cache.why(str(reference))
     ]
 
 

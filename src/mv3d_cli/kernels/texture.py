@@ -72,34 +72,39 @@ def sample_level(t: Texels, page: wp.vec4i, level: int, uv: wp.vec2) -> wp.vec4:
 
 
 @wp.func
-def sample(t: Texels, texture: int, uv: wp.vec2, along_x: wp.vec2, along_y: wp.vec2) -> wp.vec4:
-    """Anisotropic trilinear sample: `along_x`, `along_y` are the uv steps of one pixel in the picture.
+def taps_of(extent: wp.vec2, along_x: wp.vec2, along_y: wp.vec2) -> wp.vec4:
+    """(step u, step v, taps, mip level) for a footprint given by the uv steps of one pixel in the picture.
 
     Up to four taps lie along the footprint's longer axis; the mip level fits a tap (EXT_texture_filter_anisotropic).
     """
-    page = t.pages[texture]
-    base = t.levels[page[0]]
-    extent = wp.vec2(float(base[1]), float(base[2]))
     length_x = wp.length(wp.cw_mul(along_x, extent))
     length_y = wp.length(wp.cw_mul(along_y, extent))
     longer = wp.where(length_x > length_y, along_x, along_y)
     major = wp.max(length_x, length_y)
-    minor = wp.max(wp.min(length_x, length_y), 1.0e-6)
-    taps = wp.clamp(int(major / wp.max(minor, 1.0) + 0.5), 1, 4)
-    lod = wp.clamp(wp.log2(wp.max(major / float(taps), 1.0e-6)), 0.0, float(page[1] - 1))
+    minor = wp.min(length_x, length_y)
+    taps = wp.clamp(wp.floor(major / wp.max(minor, 1.0) + 0.5), 1.0, 4.0)
+    return wp.vec4(longer[0] / taps, longer[1] / taps, taps, wp.log2(wp.max(major / taps, 1.0)))
+
+
+@wp.func
+def sample(t: Texels, texture: int, uv: wp.vec2, along_x: wp.vec2, along_y: wp.vec2) -> wp.vec4:
+    """Anisotropic trilinear sample; `along_x`, `along_y` as in `taps_of`."""
+    page = t.pages[texture]
+    base = t.levels[page[0]]
+    plan = taps_of(wp.vec2(float(base[1]), float(base[2])), along_x, along_y)
+    step = wp.vec2(plan[0], plan[1])
+    lod = wp.min(plan[3], float(page[1] - 1))
     level = int(lod)
     blend = wp.clamp(2.0 * (lod - float(level)) - 0.5, 0.0, 1.0)  # close to a level, that level alone
-    if blend == 1.0:
-        level = wp.min(level + 1, page[1] - 1)
-        blend = 0.0
     total = wp.vec4()
-    for k in range(taps):
-        place = uv + longer * ((float(k) + 0.5) / float(taps) - 0.5)
+    first = uv - step * (0.5 * (plan[2] - 1.0))
+    for k in range(int(plan[2])):
+        place = first + step * float(k)
         color = sample_level(t, page, level, place)
         if blend > 0.0:
             color = wp.lerp(color, sample_level(t, page, wp.min(level + 1, page[1] - 1), place), blend)
         total += color
-    return total / float(taps)
+    return total / plan[2]
 
 
 @wp.func

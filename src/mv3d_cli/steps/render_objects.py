@@ -25,7 +25,7 @@ from mv3d_cli.formats.cameras import load_cameras, select
 from mv3d_cli.formats.images import read_image, write_png
 from mv3d_cli.formats.meshes import MeshFile, find_meshes, mesh_sources, read_mesh
 from mv3d_cli.formats.views_folder import write_views
-from mv3d_cli.kernels.runtime import cpu_count, use_threads
+from mv3d_cli.kernels.runtime import cpu_count, in_threads, use_threads
 from mv3d_cli.mapping import Outcome, map_items
 from mv3d_cli.scene.camera import Camera
 from mv3d_cli.scene.mesh import Mesh, transform, unit_sphere_from_mesh
@@ -118,10 +118,8 @@ def _digest(file: MeshFile) -> str:
 
 def render_one(config: Config, rig: Sequence[Camera], item: Object, folder: Path, tell: Tell) -> None:
     """One object's views folder, with its contact sheet."""
-    views, notes = _draw(config, rig, item, None, folder)
-    for note in notes:
+    for note in _draw(config, rig, item, None, folder, sheet=True):
         tell(Warned(note))
-    write_png(folder / "sheet.png", sheet_of_views(views))
 
 
 def render_all(config: Config, rig: Sequence[Camera], work: Sequence[Object], folder: Path, tell: Tell) -> None:
@@ -175,9 +173,9 @@ def _draw_into(config: Config, rig: tuple[Camera, ...], folder: Path, todo: tupl
 
 
 def _draw(
-    config: Config, rig: Sequence[Camera], item: Object, turn: int | None, folder: Path
-) -> tuple[Views, list[str]]:
-    """Draws one object into a views folder; returns the views and the warnings."""
+    config: Config, rig: Sequence[Camera], item: Object, turn: int | None, folder: Path, sheet: bool = False
+) -> list[str]:
+    """Draws one object into a views folder, with a contact sheet if wanted; returns the warnings."""
     rng = np.random.default_rng([config.seed, int(hashlib.sha256(item.name.encode()).hexdigest()[:8], 16), turn or 0])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -188,7 +186,10 @@ def _draw(
     light = light_for(config.lighting, rng)
     views = _engine(config)(mesh, rig, config.size, light)
     folder.mkdir(parents=True, exist_ok=True)
-    write_views(folder, views)
+    writers: list[Callable[[], None]] = [partial(write_views, folder, views)]
+    if sheet:
+        writers.append(lambda: write_png(folder / "sheet.png", sheet_of_views(views)))
+    in_threads(writers)
     record = {
         "name": item.name,
         "source": item.source.name if item.source is not None else item.digest,
@@ -199,7 +200,7 @@ def _draw(
         "warnings": notes,
     }
     (folder / "object.json").write_text(json.dumps(record, indent=1) + "\n")
-    return views, notes
+    return notes
 
 
 def _engine(config: Config) -> Callable[..., Views]:

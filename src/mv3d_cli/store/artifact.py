@@ -61,9 +61,7 @@ def open_artifact(path: Path, verify: bool = True) -> Artifact:
         raise MissingInput(f"{path} is not a folder", "Give the folder of an artifact.")
     manifest = read_manifest(path)
     if manifest is None:
-        raise DamagedArtifact(
-            f"{path / MANIFEST} is missing or damaged", "Run the command that made it again."
-        )
+        raise DamagedArtifact(f"{path / MANIFEST} is missing or damaged", "Run the command that made it again.")
     artifact = Artifact(path, manifest)
     if verify and (damage := damage_of(artifact)):
         raise DamagedArtifact(
@@ -101,9 +99,7 @@ def part_digest(artifact: Artifact, path: Path) -> str | None:
     files = artifact.manifest["files"]
     if part in files:
         return files[part][0]
-    inside = {
-        path.removeprefix(f"{part}/"): sha for path, (sha, _) in files.items() if path.startswith(f"{part}/")
-    }
+    inside = {path.removeprefix(f"{part}/"): sha for path, (sha, _) in files.items() if path.startswith(f"{part}/")}
     return digest_of_listing(inside) if inside else None
 
 
@@ -123,9 +119,7 @@ def damage_of(artifact: Artifact) -> tuple[str, ...]:
         *(f"{path} is missing" for path in expected if path not in found),
         *(f"{path} was not part of it" for path in found if path not in expected),
     )
-    return names or tuple(
-        filter(None, in_threads(lambda path: _change(found[path], path, *expected[path]), expected))
-    )
+    return names or tuple(filter(None, in_threads(lambda path: _change(found[path], path, *expected[path]), expected)))
 
 
 def _change(path: Path, name: str, sha256: str, size: int) -> str | None:

@@ -55,9 +55,7 @@ def temporary_of(folder: Path) -> Path:
 
 def cached_folders() -> Iterator[Path]:
     """The folders of all keys that have an artifact or unfinished work; they may vanish at any time."""
-    folders = {path.with_suffix("") for path in _beside("")} | {
-        path.with_suffix("") for path in _beside(".work")
-    }
+    folders = {path.with_suffix("") for path in _beside("")} | {path.with_suffix("") for path in _beside(".work")}
     return iter(sorted(folders))
 
 

@@ -45,9 +45,7 @@ def deliver(artifact: Artifact, output: Path) -> Path:
     except OSError as error:
         if ran_out_of_space(error):
             hint = "Free some space there, or give an -o on another disk; the result is kept in the cache."
-            raise OutOfSpace(
-                f"no space left, or a size limit was met, while writing {output}", hint
-            ) from error
+            raise OutOfSpace(f"no space left, or a size limit was met, while writing {output}", hint) from error
         raise OutputRefused(f"cannot write {output}: {error.strerror or error}", RENAME_HINT) from error
     return output
 
@@ -57,9 +55,7 @@ def _resolved(output: Path) -> Path:
     try:
         return output.resolve()
     except (OSError, RuntimeError, ValueError) as error:
-        raise OutputRefused(
-            f"{output} is not a usable path: {error}", "Give another name with -o."
-        ) from error
+        raise OutputRefused(f"{output} is not a usable path: {error}", "Give another name with -o.") from error
 
 
 def _is_file_wanted(target: Path, main: str | None) -> bool:
@@ -93,16 +89,12 @@ def _check_place(target: Path) -> None:
     if target == cache or cache in target.parents:
         raise OutputRefused(f"{target} lies in the cache", "Give an -o outside MV3D_CACHE_DIR.")
     if target == Path.cwd() or target in Path.cwd().parents:
-        raise OutputRefused(
-            f"{target} is the folder you are in, or holds it", "Give -o a new name, such as result/."
-        )
+        raise OutputRefused(f"{target} is the folder you are in, or holds it", "Give -o a new name, such as result/.")
     with suppress(FileNotFoundError, NotADirectoryError):
         target.lstat()  # says whether such a name can be
     above = next(folder for folder in target.parents if os.path.lexists(folder))
     if not above.is_dir():
-        raise OutputRefused(
-            f"{above} is a file, so {target} cannot be made in it", "Give another name with -o."
-        )
+        raise OutputRefused(f"{above} is a file, so {target} cannot be made in it", "Give another name with -o.")
     if not os.access(above, os.W_OK | os.X_OK):
         raise OutputRefused(f"{above} cannot be written to", "Give an -o in a folder that you can write to.")
 
@@ -118,9 +110,7 @@ def _check_file(target: Path, expected: str | None) -> None:
 def _check_folder(target: Path, main: str | None) -> None:
     if not target.is_dir():
         suffixes = f" or a name that ends in {Path(main).suffix}" if main else ""
-        raise OutputRefused(
-            f"{target} is a file, and a folder is to be written", f"Give -o a folder{suffixes}."
-        )
+        raise OutputRefused(f"{target} is a file, and a folder is to be written", f"Give -o a folder{suffixes}.")
     if not any(target.iterdir()):
         return
     manifest = read_manifest(target)

@@ -33,9 +33,7 @@ def digest_of_file(path: Path) -> str:
     try:
         return sha256_of(path)
     except OSError as error:
-        raise MissingInput(
-            f"cannot read {path}: {error.strerror}", "Check the path and its permissions."
-        ) from error
+        raise MissingInput(f"cannot read {path}: {error.strerror}", "Check the path and its permissions.") from error
 
 
 def digest_of_folder(path: Path) -> str:
@@ -45,16 +43,12 @@ def digest_of_folder(path: Path) -> str:
         return digest_of_listing(dict(zip(files, in_threads(sha256_of, files.values()), strict=True)))
     except OSError as error:
         place = error.filename or path
-        raise MissingInput(
-            f"cannot read {place}: {error.strerror}", "Check the path and its permissions."
-        ) from error
+        raise MissingInput(f"cannot read {place}: {error.strerror}", "Check the path and its permissions.") from error
 
 
 def digest_of_listing(listing: Mapping[str, str]) -> str:
     """The digest of a folder by its files' sha256s. Manifests hold times, so they are not content."""
-    content = [
-        [path, sha256] for path, sha256 in sorted(listing.items()) if PurePosixPath(path).name != MANIFEST
-    ]
+    content = [[path, sha256] for path, sha256 in sorted(listing.items()) if PurePosixPath(path).name != MANIFEST]
     return hashlib.sha256(canonical_json(content).encode("ascii")).hexdigest()
 
 

@@ -7,11 +7,11 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mv3d_cli.errors import Mv3dError, OutOfSpace, OutputRefused
-from mv3d_cli.store.digest import in_threads
 
 try:
     import fcntl
@@ -52,9 +52,7 @@ def space_watched(place: Path) -> Iterator[None]:
         raise
     except Exception as error:
         if ran_out_of_space(error):
-            raise OutOfSpace(
-                f"no space left, or a size limit was met, while writing {place}", SPACE_HINT
-            ) from error
+            raise OutOfSpace(f"no space left, or a size limit was met, while writing {place}", SPACE_HINT) from error
         raise
 
 
@@ -75,8 +73,9 @@ def sync_tree(folder: Path) -> None:
     paths = [Path(root) / name for root, _, names in os.walk(folder) for name in (*names, ".")]
     if len(paths) > SYNC_ONE_BY_ONE:
         os.sync()
-    else:
-        in_threads(sync, paths)
+    elif paths:
+        with ThreadPoolExecutor(min(8, len(paths))) as pool:  # they wait for the disk, not for a processor
+            list(pool.map(sync, paths))
 
 
 def sync(path: Path) -> None:

@@ -41,9 +41,7 @@ def describe(folder: Path, recipe: Recipe, makers: Mapping[str, Any], main: str 
     """The manifest of the files in a folder. Raises OSError, and ValueError when `main` is not there."""
     paths = files_in(folder)
     sha256s = in_threads(sha256_of, paths.values())
-    files = {
-        name: [sha, path.stat().st_size] for (name, path), sha in zip(paths.items(), sha256s, strict=True)
-    }
+    files = {name: [sha, path.stat().st_size] for (name, path), sha in zip(paths.items(), sha256s, strict=True)}
     if main is not None and main not in files:
         raise ValueError(f"step {recipe.step} promised {main} and did not write it")
     return {
@@ -112,9 +110,7 @@ def _well_formed(manifest: Mapping[str, Any]) -> bool:
         and all(isinstance(sha256, str) and isinstance(size, int) for sha256, size in files.values())
         and not any(PurePosixPath(path).is_absolute() or ".." in PurePosixPath(path).parts for path in files)
         and (manifest["main"] is None or manifest["main"] in files)
-        and all(
-            isinstance(item["label"], str) and isinstance(item["digest"], str) for item in manifest["inputs"]
-        )
+        and all(isinstance(item["label"], str) and isinstance(item["digest"], str) for item in manifest["inputs"])
     )
 
 

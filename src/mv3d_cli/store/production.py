@@ -70,9 +70,7 @@ def produce(
     with suppress(DamagedArtifact):
         artifact = _cached(job)
     if artifact is None:
-        with locked(
-            job.folder, lambda: on_notice(f"another process is making this ({recipe.step}); waiting for it")
-        ):
+        with locked(job.folder, lambda: on_notice(f"another process is making this ({recipe.step}); waiting for it")):
             artifact = _cached_or_cleared(job, on_notice)
             if artifact is None:
                 return _make(job, build)

@@ -39,9 +39,7 @@ class Recipe:
         return key_of(self.step, self.version, self.config, self.inputs, self.weights)
 
 
-def key_of(
-    step: str, version: int, config: Mapping[str, Any], inputs: Mapping[str, str], weights: str | None
-) -> str:
+def key_of(step: str, version: int, config: Mapping[str, Any], inputs: Mapping[str, str], weights: str | None) -> str:
     """The key of a recipe given by its parts, 64 hexadecimal digits."""
     parts = {"step": step, "step_version": version, "config": config, "inputs": inputs, "weights": weights}
     return hashlib.sha256(canonical_json(parts).encode("ascii")).hexdigest()
