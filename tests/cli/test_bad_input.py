@@ -87,7 +87,7 @@ BAD = {
     "outside.gltf": (outside, "outside its folder"),
     "noise.glb": (not_gltf, "gltf"),
     "empty.stl": (empty, ""),
-    "empty.glb": (empty, "truncated"),
+    "empty.glb": (empty, "gltf"),
 }
 
 

@@ -13,10 +13,20 @@ import pytest
 from mv3d_cli.formats.images import read_depth, read_image
 from mv3d_cli.formats.views_folder import read_views
 
-RIG = (
-    "front back right left front_right front_left back_right back_left "
-    "top front_right_top front_left_top back_right_top"
-).split()
+RIG = [
+    "front",
+    "back",
+    "right",
+    "left",
+    "front_right",
+    "front_left",
+    "back_right",
+    "back_left",
+    "top",
+    "front_right_top",
+    "front_left_top",
+    "back_right_top",
+]
 SMALL = ("--size", 32)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp
@@ -30,9 +30,11 @@ from mv3d_cli.mapping import Outcome, map_items
 from mv3d_cli.scene.camera import Camera
 from mv3d_cli.scene.mesh import Mesh, transform, unit_sphere_from_mesh
 from mv3d_cli.scene.views import Views
-from mv3d_cli.steps.render import Config
 from mv3d_cli.steps.settings import Progress, Tell, Warned
 from mv3d_cli.store import digest_of_file
+
+if TYPE_CHECKING:
+    from mv3d_cli.steps.render import Config
 from mv3d_cli.store.disk import ran_out_of_space
 
 SHEET_OBJECTS = 64

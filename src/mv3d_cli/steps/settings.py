@@ -32,7 +32,7 @@ class Between:
     most: float
 
     def __str__(self) -> str:
-        return f"{self.least:,} to {self.most:,}".replace(",", " ")
+        return f"{self.least} to {self.most}"
 
 
 @dataclass(frozen=True)

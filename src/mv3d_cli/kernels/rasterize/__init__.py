@@ -71,19 +71,26 @@ def eyes_of(cameras: Sequence[Camera], width: int, height: int, device: str) -> 
 
 
 def z_buffer(mesh: Triangles, eyes: wp.array, view: int, words: wp.array) -> wp.array:
-    """Fills the z-buffer words (1, height, width) of one view; returns its projected vertices (1, v)."""
-    screen = wp.empty((1, len(mesh.vertices)), dtype=wp.vec3, device=mesh.device)
+    """Fills the z-buffer words (height, width) of one view; returns its projected vertices (v,)."""
+    screen = wp.empty(len(mesh.vertices), dtype=wp.vec3, device=mesh.device)
     words.fill_(source.EMPTY)
-    inputs = [eyes, view, mesh.vertices, screen]
-    wp.launch(source.project, (1, len(mesh.vertices)), inputs, device=mesh.device)
+    block = block_of(mesh.device)
+    given = [eyes, view, block, mesh.vertices, screen]
+    wp.launch(source.project, -(-len(mesh.vertices) // block), given, device=mesh.device)
     phases = 1 if mesh.device == "cpu" else max(1, min(64, 200_000 // max(len(mesh.faces), 1)))
+    place = (mesh.vertices, mesh.faces, screen, mesh.cutouts)
 
     def fill(band: tuple[int, int]) -> None:
-        given = [eyes, view, wp.vec2i(*band), mesh.vertices, mesh.faces, screen, mesh.cutouts, phases, words]
-        wp.launch(source.fill_z_buffer, (1, len(mesh.faces), phases), given, device=mesh.device)
+        given = [eyes, view, wp.vec2i(*band), block, *place, phases, words]
+        wp.launch(source.fill_z_buffer, (-(-len(mesh.faces) // block), phases), given, device=mesh.device)
 
-    in_threads([partial(fill, band) for band in bands(words.shape[1], workers(mesh.device))])
+    in_threads([partial(fill, band) for band in bands(words.shape[0], workers(mesh.device))])
     return screen
+
+
+def block_of(device: str) -> int:
+    """Items that one thread of a launch takes."""
+    return 64 if device == "cpu" else 1
 
 
 def workers(device: str) -> int:
@@ -93,7 +100,7 @@ def workers(device: str) -> int:
 
 def new_words(height: int, width: int, device: str) -> wp.array:
     """Room for one view's z-buffer words."""
-    return wp.empty((1, height, width), dtype=wp.int64, device=device)
+    return wp.empty((height, width), dtype=wp.int64, device=device)
 
 
 def bands(rows: int, count: int) -> list[tuple[int, int]]:
@@ -119,7 +126,7 @@ def rasterize(vertices: Any, faces: Any, cameras: Sequence[Camera], width: int, 
         words = new_words(height, width, device)
         for view in range(*views):
             screen = z_buffer(mesh, eyes, view, words)
-            _resolve(mesh, eyes, view, screen, words, [output[view : view + 1] for output in outputs])
+            _resolve(mesh, eyes, view, screen, words, [output[view] for output in outputs])
 
     few = len(cameras) < workers(device)  # few views: each is split by rows; many: the views are split
     in_threads([partial(draw, part) for part in bands(len(cameras), 1 if few else workers(device))])
@@ -131,8 +138,10 @@ def _resolve(
 ) -> None:
     """Words of one view into its face index, barycentrics and depth."""
 
-    def rows(band: tuple[int, int]) -> None:
-        given = [eyes, view, band[0], mesh.vertices, mesh.faces, screen, words, *outputs]
-        wp.launch(source.resolve, (1, band[1] - band[0], words.shape[2]), given, device=mesh.device)
+    block = block_of(mesh.device)
 
-    in_threads([partial(rows, band) for band in bands(words.shape[1], workers(mesh.device))])
+    def rows(band: tuple[int, int]) -> None:
+        given = [eyes, view, band[0], block, mesh.vertices, mesh.faces, screen, words, *outputs]
+        wp.launch(source.resolve, (band[1] - band[0], -(-words.shape[1] // block)), given, device=mesh.device)
+
+    in_threads([partial(rows, band) for band in bands(words.shape[0], workers(mesh.device))])

@@ -184,7 +184,7 @@ def slope(face: Footprint, parts: wp.vec3, perspective: int) -> float:
 @wp.func
 def run_inside(start: wp.vec3, right: wp.vec3, per_right: wp.vec3, columns: int) -> wp.vec2i:
     """The run of columns, [first, end), in which start + right * column stays positive in all three parts."""
-    first = float(0.0)
+    first = wp.float32(0.0)
     last = float(columns - 1)
     for i in range(3):
         crossing = -start[i] * per_right[i]

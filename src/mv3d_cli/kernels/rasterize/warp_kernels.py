@@ -2,7 +2,7 @@
 
 A sample's z-buffer word holds the bits of z (positive floats order like integers) above the face's index, so that one
 atomic minimum settles visibility, the same way on every device and in any order. A face of equal depth and lower
-index wins.
+index wins. On a CPU a thread of a launch takes a block of items, since it unpacks its arguments anew each time.
 """
 
 from __future__ import annotations
@@ -37,10 +37,18 @@ class Cutouts:
 
 
 @wp.kernel
-def project(eyes: wp.array(dtype=Eye), view: int, vertices: wp.array(dtype=wp.vec3), screen: wp.array2d(dtype=wp.vec3)):
-    """Vertices into the picture: (column, row, z)."""
-    v, i = wp.tid()
-    screen[v, i] = in_picture(eyes[view + v], in_camera(eyes[view + v], vertices[i]))
+def project(
+    eyes: wp.array(dtype=Eye),
+    view: int,
+    block: int,
+    vertices: wp.array(dtype=wp.vec3),
+    screen: wp.array(dtype=wp.vec3),
+):
+    """Vertices into the picture, (column, row, z); `block` of them a thread."""
+    part = wp.tid()
+    eye = eyes[view]
+    for i in range(part * block, wp.min((part + 1) * block, vertices.shape[0])):
+        screen[i] = in_picture(eye, in_camera(eye, vertices[i]))
 
 
 @wp.func
@@ -76,63 +84,85 @@ def is_kept(cutouts: Cutouts, index: int, corners: wp.vec3i, shares: wp.vec3) ->
     return sample_alpha(cutouts.texels, cutouts.texture[index], uv) >= cutouts.cutoff[index]
 
 
-@wp.kernel
-def fill_z_buffer(
-    eyes: wp.array(dtype=Eye),
-    first_view: int,
-    band: wp.vec2i,
+@wp.func
+def draw_face(
+    eye: Eye,
     vertices: wp.array(dtype=wp.vec3),
-    faces: wp.array(dtype=wp.vec3i),
-    screen: wp.array2d(dtype=wp.vec3),
+    corners: wp.vec3i,
+    screen: wp.array(dtype=wp.vec3),
     cutouts: Cutouts,
-    phases: int,
-    words: wp.array3d(dtype=wp.int64),
+    index: int,
+    rows: wp.vec3i,
+    words: wp.array2d(dtype=wp.int64),
 ):
-    """Every face into the z-buffer, rows `band` of it; the launch's third axis interleaves the rows of one face."""
-    view, index, phase = wp.tid()
-    eye = eyes[first_view + view]
-    corners = faces[index]
-    size = wp.vec2i(words.shape[2], words.shape[1])
-    face = footprint_of(eye, vertices, corners, screen[view], size)
+    """One face into the z-buffer: of `rows` = (first, end, step) those that it meets."""
+    face = footprint_of(eye, vertices, corners, screen, wp.vec2i(words.shape[1], words.shape[0]))
+    first = wp.max(face.top, rows[0])
+    end = wp.min(face.bottom_end, rows[1])
+    if first >= end or face.left >= face.right_end:
+        return
     tested = is_tested(cutouts, index)
     per_right = wp.vec3(1.0 / face.right[0], 1.0 / face.right[1], 1.0 / face.right[2])
-    for row in range(wp.max(face.top, band[0]) + phase, wp.min(face.bottom_end, band[1]), phases):
+    z_right = slope(face, face.right, eye.perspective)
+    for row in range(first, end, rows[2]):
         start = face.value + face.down * float(row - face.top)
         run = run_inside(start, face.right, per_right, face.right_end - face.left)
         z_start = slope(face, start, eye.perspective)
-        z_right = slope(face, face.right, eye.perspective)
         for step in range(run[0], run[1]):
             z = z_start + z_right * float(step)
             if eye.perspective == 1:
                 z = 1.0 / z
             if z > NEAR and (not tested or is_kept(cutouts, index, corners, start + face.right * float(step))):
-                wp.atomic_min(words, view, row, face.left + step, word_from(z, index))
+                wp.atomic_min(words, row, face.left + step, word_from(z, index))
+
+
+@wp.kernel
+def fill_z_buffer(
+    eyes: wp.array(dtype=Eye),
+    view: int,
+    band: wp.vec2i,
+    block: int,
+    vertices: wp.array(dtype=wp.vec3),
+    faces: wp.array(dtype=wp.vec3i),
+    screen: wp.array(dtype=wp.vec3),
+    cutouts: Cutouts,
+    phases: int,
+    words: wp.array2d(dtype=wp.int64),
+):
+    """Faces into rows `band` of the z-buffer: a thread draws every `phases`-th row of `block` faces."""
+    part, phase = wp.tid()
+    eye = eyes[view]
+    rows = wp.vec3i(band[0] + phase, band[1], phases)
+    for index in range(part * block, wp.min((part + 1) * block, faces.shape[0])):
+        draw_face(eye, vertices, faces[index], screen, cutouts, index, rows, words)
 
 
 @wp.kernel
 def resolve(
     eyes: wp.array(dtype=Eye),
-    first_view: int,
+    view: int,
     first_row: int,
+    run: int,
     vertices: wp.array(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3i),
-    screen: wp.array2d(dtype=wp.vec3),
-    words: wp.array3d(dtype=wp.int64),
-    face_out: wp.array3d(dtype=wp.int32),
-    barycentric_out: wp.array3d(dtype=wp.vec3),
-    depth_out: wp.array3d(dtype=wp.float32),
+    screen: wp.array(dtype=wp.vec3),
+    words: wp.array2d(dtype=wp.int64),
+    face_out: wp.array2d(dtype=wp.int32),
+    barycentric_out: wp.array2d(dtype=wp.vec3),
+    depth_out: wp.array2d(dtype=wp.float32),
 ):
-    """Z-buffer words into face index (-1 = none), barycentrics and depth (0 = none)."""
-    view, row_in_band, column = wp.tid()
+    """Z-buffer words into face index (-1 = none), barycentrics and depth (0 = none), `run` pixels a thread."""
+    row_in_band, part = wp.tid()
     row = first_row + row_in_band
-    word = words[view, row, column]
-    index = face_from(word)
-    face_out[view, row, column] = index
-    if index < 0:
-        barycentric_out[view, row, column] = wp.vec3()
-        depth_out[view, row, column] = 0.0
-        return
-    place = wp.vec2(float(column) + 0.5, float(row) + 0.5)
-    eye = eyes[first_view + view]
-    barycentric_out[view, row, column] = barycentric_at(eye, vertices, faces[index], screen[view], place)
-    depth_out[view, row, column] = depth_from(word)
+    eye = eyes[view]
+    for column in range(part * run, wp.min((part + 1) * run, words.shape[1])):
+        word = words[row, column]
+        index = face_from(word)
+        face_out[row, column] = index
+        if index >= 0:
+            place = wp.vec2(float(column) + 0.5, float(row) + 0.5)
+            barycentric_out[row, column] = barycentric_at(eye, vertices, faces[index], screen, place)
+            depth_out[row, column] = depth_from(word)
+        else:
+            barycentric_out[row, column] = wp.vec3()
+            depth_out[row, column] = 0.0

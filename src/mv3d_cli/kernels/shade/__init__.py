@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 from jaxtyping import Float, UInt8
 
-from mv3d_cli.kernels.rasterize import Triangles, eye_of, eyes_of, new_words, triangles, z_buffer
+from mv3d_cli.kernels.rasterize import Triangles, block_of, eye_of, eyes_of, new_words, triangles, z_buffer
 from mv3d_cli.kernels.rasterize import warp_kernels as raster
 from mv3d_cli.kernels.runtime import load
 from mv3d_cli.kernels.shade import warp_kernels as source
@@ -191,17 +191,17 @@ def draw(mesh: Model, lit: source.Lights, camera: Camera, width: int, height: in
     depth = wp.empty((height, width), dtype=wp.float32, device=device)
     normal = wp.empty((height, width, 3), dtype=wp.uint8, device=device)
     place = (mesh.triangles.vertices, mesh.triangles.faces)
-    run = 64 if device == "cpu" else 1  # a CPU thread unpacks its arguments once a run
+    block = block_of(device)
 
     eyes = eyes_of([camera], width * SAMPLES, height * SAMPLES, device)
     words = new_words(height * SAMPLES, width * SAMPLES, device)
     screen = z_buffer(mesh.triangles, eyes, 0, words)
-    given = [eyes, 0, run, *place, screen, words, mesh.surface, lit, _codes(device), color]
-    wp.launch(source.color, (height, -(-width // run)), given, device=device)
+    given = [eyes, 0, block, *place, screen, words, mesh.surface, lit, _codes(device), color]
+    wp.launch(source.color, (height, -(-width // block)), given, device=device)
 
     eyes = eyes_of([camera], width, height, device)
     words = new_words(height, width, device)
     screen = z_buffer(mesh.triangles, eyes, 0, words)
-    given = [eyes, 0, run, *place, screen, words, mesh.surface, depth, normal]
-    wp.launch(source.geometry, (height, -(-width // run)), given, device=device)
+    given = [eyes, 0, block, *place, screen, words, mesh.surface, depth, normal]
+    wp.launch(source.geometry, (height, -(-width // block)), given, device=device)
     return Picture(color.numpy().view(np.uint8).reshape(height, width, 4), depth.numpy(), normal.numpy())

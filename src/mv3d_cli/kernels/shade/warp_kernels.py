@@ -2,16 +2,15 @@
 
 Colour is multisampled: the z-buffer has 2 x 2 samples a pixel; each face among a pixel's samples is
 shaded once, at the centre or amid the samples it covers, with a texture footprint of one pixel, in linear light.
-Light: second-order spherical harmonics (Ramamoorthi & Hanrahan, 2001), one directional light with a shadow map
-(percentage-closer filtering, Reeves et al., 1987), and a Blinn-Phong highlight.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-from mv3d_cli.kernels.rasterize.footprint import Eye, barycentric_at, in_camera, in_picture
+from mv3d_cli.kernels.rasterize.footprint import Eye, barycentric_at
 from mv3d_cli.kernels.rasterize.warp_kernels import depth_from, face_from
+from mv3d_cli.kernels.shade.light import Lights, lit
 from mv3d_cli.kernels.texture import Texels, sample
 
 wp.set_module_options({"enable_backward": False})
@@ -31,20 +30,6 @@ class Surface:
     texture: wp.array(dtype=wp.int32)
     gloss: wp.array(dtype=wp.float32)
     texels: Texels
-
-
-@wp.struct
-class Lights:
-    """lit = 0: albedo. ambient: 9 coefficients, already convolved with the cosine and divided by pi."""
-
-    lit: wp.int32
-    ambient: wp.array(dtype=wp.vec3)
-    sun_direction: wp.vec3
-    sun_color: wp.vec3
-    specular: wp.float32
-    shadow_eye: Eye
-    shadow_words: wp.array3d(dtype=wp.int64)
-    shadow_softness: wp.float32
 
 
 @wp.func
@@ -82,53 +67,6 @@ def normal_at(
     if wp.dot(smooth, flat) <= 0.0:
         return flat * side
     return wp.normalize(smooth) * side
-
-
-@wp.func
-def ambient_at(lights: Lights, n: wp.vec3) -> wp.vec3:
-    """Irradiance over pi from the environment, by the nine real spherical harmonics of degree 2."""
-    c = lights.ambient
-    value = c[0] * 0.282095
-    value += (c[1] * n[1] + c[2] * n[2] + c[3] * n[0]) * 0.488603
-    value += (c[4] * (n[0] * n[1]) + c[5] * (n[1] * n[2]) + c[7] * (n[0] * n[2])) * 1.092548
-    value += c[6] * (0.315392 * (3.0 * n[2] * n[2] - 1.0)) + c[8] * (0.546274 * (n[0] * n[0] - n[1] * n[1]))
-    return wp.max(value, wp.vec3())
-
-
-@wp.func
-def sun_at(lights: Lights, point: wp.vec3, n: wp.vec3) -> float:
-    """The share of the sun that reaches a point: nine taps of the shadow map, the point lifted off its surface."""
-    lifted = point + n * 0.012
-    place = in_picture(lights.shadow_eye, in_camera(lights.shadow_eye, lifted))
-    rows = lights.shadow_words.shape[1]
-    columns = lights.shadow_words.shape[2]
-    light = float(0.0)
-    for i in range(3):
-        for j in range(3):
-            row = int(wp.floor(place[1] + float(i - 1) * lights.shadow_softness))
-            column = int(wp.floor(place[0] + float(j - 1) * lights.shadow_softness))
-            row = wp.clamp(row, 0, rows - 1)
-            column = wp.clamp(column, 0, columns - 1)
-            word = lights.shadow_words[0, row, column]
-            if face_from(word) < 0 or place[2] < depth_from(word) + 0.008:
-                light += 1.0 / 9.0
-    return light
-
-
-@wp.func
-def lit(lights: Lights, albedo: wp.vec3, gloss: float, point: wp.vec3, n: wp.vec3, viewer: wp.vec3) -> wp.vec3:
-    """Linear colour that leaves a point towards the viewer."""
-    light = ambient_at(lights, n)
-    facing = wp.dot(n, lights.sun_direction)
-    highlight = float(0.0)
-    if facing > 0.0:
-        sun = sun_at(lights, point, n)
-        light += lights.sun_color * (facing * sun)
-        if lights.specular * gloss > 0.0:
-            halfway = wp.normalize(lights.sun_direction + viewer)
-            exponent = wp.pow(2.0, 2.0 + 7.0 * gloss)
-            highlight = lights.specular * gloss * sun * wp.pow(wp.max(wp.dot(n, halfway), 0.0), exponent)
-    return wp.cw_mul(albedo, light) + lights.sun_color * highlight
 
 
 @wp.func
@@ -228,8 +166,8 @@ def pixel_at(
     """One pixel, of whose samples at least one shows a face; `corner` is its upper left, in samples."""
     middle = corner + wp.vec2(1.0, 1.0)
     total = wp.vec3()
-    covered = float(0.0)
-    k = int(0)
+    covered = wp.float32(0.0)
+    k = wp.int32(0)
     while k < 4:  # not a `for`, which Warp would unroll into four copies of the shading
         if seen[k] >= 0:
             centre = centre_of(seen, k)
@@ -246,44 +184,44 @@ def pixel_at(
 def color(
     eyes: wp.array(dtype=Eye),
     view: int,
-    run: int,
+    block: int,
     vertices: wp.array(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3i),
-    screen: wp.array2d(dtype=wp.vec3),
-    words: wp.array3d(dtype=wp.int64),
+    screen: wp.array(dtype=wp.vec3),
+    words: wp.array2d(dtype=wp.int64),
     surface: Surface,
     lights: Lights,
     codes: wp.array(dtype=wp.uint8),
     out: wp.array2d(dtype=wp.uint32),
 ):
-    """Pixels, sRGB with straight alpha, from a z-buffer twice as fine; a thread draws `run` of them in a row."""
+    """Pixels, sRGB with straight alpha, from a z-buffer twice as fine; `block` of them a thread."""
     row, part = wp.tid()
     eye = eyes[view]
     upper = row * 2
-    for column in range(part * run, wp.min((part + 1) * run, out.shape[1])):
+    for column in range(part * block, wp.min((part + 1) * block, out.shape[1])):
         left = column * 2
         seen = wp.vec4i(
-            face_from(words[0, upper, left]),
-            face_from(words[0, upper, left + 1]),
-            face_from(words[0, upper + 1, left]),
-            face_from(words[0, upper + 1, left + 1]),
+            face_from(words[upper, left]),
+            face_from(words[upper, left + 1]),
+            face_from(words[upper + 1, left]),
+            face_from(words[upper + 1, left + 1]),
         )
         if wp.max(seen) < 0:
             out[row, column] = wp.uint32(0)
         else:
             corner = wp.vec2(float(left), float(upper))
-            out[row, column] = pixel_at(eye, vertices, faces, screen[0], surface, lights, codes, seen, corner)
+            out[row, column] = pixel_at(eye, vertices, faces, screen, surface, lights, codes, seen, corner)
 
 
 @wp.kernel
 def geometry(
     eyes: wp.array(dtype=Eye),
     view: int,
-    run: int,
+    block: int,
     vertices: wp.array(dtype=wp.vec3),
     faces: wp.array(dtype=wp.vec3i),
-    screen: wp.array2d(dtype=wp.vec3),
-    words: wp.array3d(dtype=wp.int64),
+    screen: wp.array(dtype=wp.vec3),
+    words: wp.array2d(dtype=wp.int64),
     surface: Surface,
     depth_out: wp.array2d(dtype=wp.float32),
     normal_out: wp.array3d(dtype=wp.uint8),
@@ -291,14 +229,14 @@ def geometry(
     """Depth (0 = none) and normal bytes (128 = none) at pixel centres; normals in the viewer's axes."""
     row, part = wp.tid()
     eye = eyes[view]
-    for column in range(part * run, wp.min((part + 1) * run, depth_out.shape[1])):
-        word = words[0, row, column]
+    for column in range(part * block, wp.min((part + 1) * block, depth_out.shape[1])):
+        word = words[row, column]
         index = face_from(word)
         n = wp.vec3()
         if index >= 0:
             corners = faces[index]
             place = wp.vec2(float(column) + 0.5, float(row) + 0.5)
-            b = barycentric_at(eye, vertices, corners, screen[0], place)
+            b = barycentric_at(eye, vertices, corners, screen, place)
             world = normal_at(surface, vertices, corners, b, towards_eye(eye, point_at(vertices, corners, b)))
             n = wp.vec3(eye.rotation * wp.vec3d(world))
             n = wp.vec3(n[0], -n[1], -n[2])
