@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from mv3d_cli.formats.images import read_image
 
@@ -180,8 +181,8 @@ def test_a_texture_that_can_be_had_is_not_grey(mv3d, tmp_path):
 
 
 def test_a_huge_texture_takes_little_memory(tmp_path):
-    large = cv2.imencode(".png", np.full((20_000, 20_000), 255, np.uint8), [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
-    mesh = textured(tmp_path / "obj", large.tobytes())
+    mesh = textured(tmp_path / "obj", None)
+    Image.new("L", (20_000, 20_000), "white").save(mesh.with_name("a.png"), compress_level=1)
     done, gigabytes = measured(["render", mesh, *TINY, "--lighting", "none", "--views", "front"])
     assert "20000" in done.stderr
     assert (done.returncode, gigabytes < 2) == (0, True), (done.stderr, gigabytes)
@@ -192,7 +193,7 @@ def test_a_mesh_of_two_million_faces(tmp_path):
     side = 1001
     x, y = np.meshgrid(*[np.linspace(-1, 1, side, dtype=np.float32)] * 2)
     corner = (np.arange(side - 1)[:, None] * side + np.arange(side - 1)).reshape(-1, 1)
-    faces = (corner + [[0, 1, side + 1, 0, side + 1, side]]).reshape(-1, 3)
+    faces = (corner + np.array([0, 1, side + 1, 0, side + 1, side])).reshape(-1, 3)
     write_ply(tmp_path / "grid.ply", np.stack([x, y, 0.3 * np.sin(3 * x)], axis=-1).reshape(-1, 3), faces)
     done, gigabytes = measured(["render", tmp_path / "grid.ply", "--size", 64, "--views", "front,top"])
     assert (done.returncode, gigabytes < 4) == (0, True), (done.stderr, gigabytes)

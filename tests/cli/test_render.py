@@ -10,23 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mv3d_cli.formats.cameras import HORIZONTAL
 from mv3d_cli.formats.images import read_depth, read_image
 from mv3d_cli.formats.views_folder import read_views
 
-RIG = [
-    "front",
-    "back",
-    "right",
-    "left",
-    "front_right",
-    "front_left",
-    "back_right",
-    "back_left",
-    "top",
-    "front_right_top",
-    "front_left_top",
-    "back_right_top",
-]
+RIG = [*HORIZONTAL, "top", "front_right_top", "front_left_top", "back_right_top"]
 SMALL = ("--size", 32)
 
 
@@ -49,8 +37,8 @@ def test_stdout_is_the_path_of_a_views_folder(mv3d, ball):
     ran = mv3d("render", ball, *SMALL)
     assert ran.stdout == f"{ran.path}\n"
     assert ran.stderr == ""
-    files = [f"{kind}/{name}.{end}" for kind, end in zip(("color", "depth", "normal"), ("png", "exr", "png"), strict=True)
-             for name in RIG]  # fmt: skip
+    kinds = {"color": "png", "depth": "exr", "normal": "png"}
+    files = [f"{kind}/{name}.{end}" for kind, end in kinds.items() for name in RIG]
     assert sorted(inodes(ran.path)) == sorted([*files, "transforms.json", "object.json", "sheet.png", "artifact.json"])
     views = read_views(ran.path)
     assert [view.camera.name for view in views.frames] == RIG
@@ -153,7 +141,6 @@ def test_lighting(mv3d, meshes):
     assert colours("--lighting", "none") == {(128, 128, 128, 255)}
     studio = colours("--lighting", "studio")
     assert len(studio) > 2
-    assert colours("--lighting", "studio", "--seed", 1) == studio
     assert colours() != colours("--seed", 1)
 
 

@@ -8,6 +8,7 @@ import random
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +19,7 @@ from mv3d_cli.formats.images import read_image
 from mv3d_cli.formats.views_folder import read_views
 
 TINY = ("--size", 16)
-MANY = ("--procedural", 8, "--size", 128)
+MANY = ("--procedural", 6, "--size", 128)
 
 
 def digest(folder: Path) -> str:
@@ -52,8 +53,6 @@ def wait_for(count: int, cache: Path, process: subprocess.Popen[str]) -> dict[st
 
 @pytest.fixture(scope="module")
 def command() -> str:
-    import sys
-
     return str(Path(sys.executable).parent / "mv3d")
 
 
@@ -190,7 +189,7 @@ def test_a_single_render_killed_at_any_moment(mv3d, command, ball, cache_folder)
     for attempt in range(20):
         cache = cache_folder / str(attempt)
         process = started([command, "render", ball, "--size", 64], cache)
-        time.sleep(rng.uniform(0.2, 1.5))
+        time.sleep(rng.uniform(0.2, 1.2))
         os.killpg(process.pid, signal.SIGKILL)
         process.communicate()
         for manifest in cache.rglob("artifact.json"):

@@ -64,7 +64,7 @@ def test_uv_outside_the_texture_wrap(wrap: Wrap, index: np.ndarray) -> None:
 
 def test_each_face_has_its_own_material() -> None:
     half = quad(Material()).vertices * 0.5
-    vertices = np.concatenate([half - [0.5, 0, 0], half + [0.5, 0, 0]]).astype(np.float32)
+    vertices = np.concatenate([half - np.array([0.5, 0, 0]), half + np.array([0.5, 0, 0])]).astype(np.float32)
     faces = np.array([[0, 2, 1], [0, 3, 2], [4, 6, 5], [4, 7, 6]], np.int32)
     red, green = Material(base_color=(1.0, 0.0, 0.0, 1.0)), Material(base_color=(0.0, 1.0, 0.0, 1.0))
     mesh = Mesh(vertices, faces, np.array([0, 0, 1, 1], np.int32), (red, green))

@@ -20,7 +20,7 @@ from mv3d_cli.capture.lighting import light_for
 from mv3d_cli.capture.rendering import render
 from mv3d_cli.capture.shapes import procedural_mesh
 from mv3d_cli.capture.sheet import sheet_of_objects, sheet_of_views
-from mv3d_cli.errors import BadMesh, InputError, MissingDependency, MissingInput, Mv3dError, UsageError
+from mv3d_cli.errors import BadMesh, InputError, MissingDependency, MissingInput, Mv3dError, UsageError, WorkFailed
 from mv3d_cli.formats.cameras import load_cameras, select
 from mv3d_cli.formats.images import read_image, write_png
 from mv3d_cli.formats.meshes import MeshFile, find_meshes, mesh_sources, read_mesh
@@ -125,24 +125,30 @@ def render_one(config: Config, rig: Sequence[Camera], item: Object, folder: Path
 
 
 def render_all(config: Config, rig: Sequence[Camera], work: Sequence[Object], folder: Path, tell: Tell) -> None:
-    """A data-set folder: goes on from what lies in `folder`, and does not stop for an object that fails."""
+    """A data-set folder: goes on from what lies in `folder`, and does not stop for an object that fails.
+
+    Raises MissingInput or WorkFailed where not one could be drawn, and what concerns all at once.
+    """
     turns = list(range(config.rotations)) if config.rotations else [None]
     places = {_place(item, turn): (item, turn) for item in work for turn in turns}
     waiting = [place for place in places if not (folder / place).is_dir()]
     _sweep(folder)
     jobs = min(config.jobs or cpu_count(), len(waiting))
     todo = [(place, *places[place]) for place in waiting]
-    failures, done = [], len(places) - len(waiting)
+    failed: list[Outcome] = []
+    done = len(places) - len(waiting)
     draw = partial(_draw_into, config, tuple(rig), folder)
     for outcome in map_items(draw, todo, max(jobs, 1), partial(use_threads, 1)):
         done += 1
         if outcome.error is not None:
             if _concerns_all(outcome.error):
                 raise outcome.error
-            failures.append(_failure(outcome))
+            failed.append(outcome)
         tell(Progress(done, len(places), "objects"))
     _sweep(folder)
-    _finish(folder, places, failures, tell)
+    failed.sort(key=lambda outcome: outcome.item[0])
+    _check_drawn(failed, len(places))
+    _finish(folder, places, [_failure(outcome) for outcome in failed], tell)
 
 
 def _sweep(folder: Path) -> None:
@@ -243,16 +249,19 @@ def _failure(outcome: Outcome) -> dict[str, Any]:
     return {"name": place, "source": source, "reason": reason, "hint": hint}
 
 
+def _check_drawn(outcomes: Sequence[Outcome], count: int) -> None:
+    """Raises MissingInput or WorkFailed where not one of `count` objects could be drawn."""
+    if len(outcomes) < count:
+        return
+    reasons = [_failure(outcome) for outcome in outcomes]
+    kind = MissingInput if all(isinstance(outcome.error, InputError) for outcome in outcomes) else WorkFailed
+    first = f"{reasons[0]['name']}: {reasons[0]['reason']}"
+    raise kind(f"none of {count} objects could be rendered; {first}", reasons[0]["hint"])
+
+
 def _finish(folder: Path, places: dict[str, Any], failures: list[dict[str, Any]], tell: Tell) -> None:
-    """Index, failures and contact sheet of a batch. Raises MissingInput when nothing could be drawn."""
+    """Index, failures and contact sheet of a batch."""
     drawn = [place for place in places if (folder / place).is_dir()]
-    failures.sort(key=lambda failure: failure["name"])
-    if not drawn:
-        first = failures[0]
-        raise MissingInput(
-            f"none of {len(places)} objects could be rendered; {first['name']}: {first['reason']}",
-            first["hint"],
-        )
     if failures:
         tell(Warned(f"{len(failures)} of {len(places)} objects failed; failures.json says why"))
     records = [json.loads((folder / place / "object.json").read_text()) | {"folder": place} for place in drawn]
