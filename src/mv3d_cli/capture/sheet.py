@@ -17,8 +17,11 @@ GAP = 4
 INK = (60, 60, 60)
 
 
-def _fit(picture: np.ndarray, interpolation: int = cv2.INTER_AREA) -> np.ndarray:
-    """The picture brought to the cell's size, its shape kept."""
+def _fit(picture: np.ndarray, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
+    """The picture brought to the cell's size, its shape kept: halved while it is twice as large, then interpolated."""
+    while interpolation == cv2.INTER_LINEAR and max(picture.shape[:2]) >= 2 * CELL and min(picture.shape[:2]) > 1:
+        half = (picture.shape[1] // 2, picture.shape[0] // 2)
+        picture = cv2.resize(picture, half, interpolation=cv2.INTER_AREA)
     height, width = picture.shape[:2]
     scale = CELL / max(height, width)
     shape = (max(round(width * scale), 1), max(round(height * scale), 1))

@@ -19,7 +19,7 @@ import warp as wp
 
 from mv3d_cli.kernels.rasterize import warp_kernels as source
 from mv3d_cli.kernels.rasterize.footprint import Eye
-from mv3d_cli.kernels.runtime import device_of, in_threads, like, load, threads, to_warp
+from mv3d_cli.kernels.runtime import device_of, empty, in_threads, like, load, threads, to_warp
 from mv3d_cli.scene.camera import Camera, Perspective, pixel_from_camera
 
 
@@ -72,7 +72,7 @@ def eyes_of(cameras: Sequence[Camera], width: int, height: int, device: str) -> 
 
 def z_buffer(mesh: Triangles, eyes: wp.array, view: int, words: wp.array) -> wp.array:
     """Fills the z-buffer words (height, width) of one view; returns its projected vertices (v,)."""
-    screen = wp.empty(len(mesh.vertices), dtype=wp.vec3, device=mesh.device)
+    screen = empty((len(mesh.vertices),), dtype=wp.vec3, device=mesh.device)
     words.fill_(source.EMPTY)
     block = block_of(mesh.device)
     given = [eyes, view, block, mesh.vertices, screen]
@@ -100,7 +100,7 @@ def workers(device: str) -> int:
 
 def new_words(height: int, width: int, device: str) -> wp.array:
     """Room for one view's z-buffer words."""
-    return wp.empty((height, width), dtype=wp.int64, device=device)
+    return empty((height, width), dtype=wp.int64, device=device)
 
 
 def bands(rows: int, count: int) -> list[tuple[int, int]]:
@@ -120,7 +120,7 @@ def rasterize(vertices: Any, faces: Any, cameras: Sequence[Camera], width: int, 
     mesh = triangles(vertices, faces, device=device)
     eyes = eyes_of(cameras, width, height, device)
     shape = (len(cameras), height, width)
-    outputs = [wp.empty(shape, dtype=kind, device=device) for kind in (wp.int32, wp.vec3, wp.float32)]
+    outputs = [empty(shape, dtype=kind, device=device) for kind in (wp.int32, wp.vec3, wp.float32)]
 
     def draw(views: tuple[int, int]) -> None:
         words = new_words(height, width, device)

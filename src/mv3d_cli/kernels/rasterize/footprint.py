@@ -170,7 +170,7 @@ def barycentric_at(
     parts = wp.vec3(qx * ry - qy * rx, rx * py - ry * px, px * qy - py * qx)
     if eye.perspective == 1:
         parts = wp.vec3(parts[0] / p[2], parts[1] / q[2], parts[2] / r[2])
-    return parts / (parts[0] + parts[1] + parts[2])
+    return parts * (1.0 / (parts[0] + parts[1] + parts[2]))
 
 
 @wp.func

@@ -23,7 +23,7 @@ from mv3d_cli.kernels.texture import Texels, sample_alpha
 
 wp.set_module_options({"enable_backward": False})
 
-EMPTY = 0x7FFFFFFFFFFFFFFF
+EMPTY = 0x7F8000007FFFFFFF  # infinitely far, no face
 
 
 @wp.struct

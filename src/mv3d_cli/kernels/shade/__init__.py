@@ -15,7 +15,7 @@ from jaxtyping import Float, UInt8
 
 from mv3d_cli.kernels.rasterize import Triangles, block_of, eye_of, eyes_of, new_words, triangles, z_buffer
 from mv3d_cli.kernels.rasterize import warp_kernels as raster
-from mv3d_cli.kernels.runtime import load
+from mv3d_cli.kernels.runtime import empty, load
 from mv3d_cli.kernels.shade import warp_kernels as source
 from mv3d_cli.kernels.texture import CLAMP, MIRROR, REPEAT, Texels
 from mv3d_cli.scene.camera import Camera
@@ -187,9 +187,9 @@ SAMPLES = 2  # z-buffer samples a pixel, along each side
 def draw(mesh: Model, lit: source.Lights, camera: Camera, width: int, height: int) -> Picture:
     """One view of the model: colour with 2x2 samples a pixel, depth and normals at pixel centres."""
     device = mesh.triangles.device
-    color = wp.empty((height, width), dtype=wp.uint32, device=device)
-    depth = wp.empty((height, width), dtype=wp.float32, device=device)
-    normal = wp.empty((height, width, 3), dtype=wp.uint8, device=device)
+    color = empty((height, width), dtype=wp.uint32, device=device)
+    depth = empty((height, width), dtype=wp.float32, device=device)
+    normal = empty((height, width, 3), dtype=wp.uint8, device=device)
     place = (mesh.triangles.vertices, mesh.triangles.faces)
     block = block_of(device)
 

@@ -44,17 +44,15 @@ def sun_at(lights: Lights, point: wp.vec3, n: wp.vec3) -> float:
     """The share of the sun that reaches a point: nine taps of the shadow map, the point lifted off its surface."""
     lifted = point + n * 0.012
     place = in_picture(lights.shadow_eye, in_camera(lights.shadow_eye, lifted))
-    rows = lights.shadow_words.shape[0]
-    columns = lights.shadow_words.shape[1]
+    reach = lights.shadow_softness
+    x = wp.clamp(place[0], reach, float(lights.shadow_words.shape[1] - 1) - reach)
+    y = wp.clamp(place[1], reach, float(lights.shadow_words.shape[0] - 1) - reach)
+    nearest = place[2] - 0.008
     light = wp.float32(0.0)
     for i in range(3):
         for j in range(3):
-            row = int(wp.floor(place[1] + float(i - 1) * lights.shadow_softness))
-            column = int(wp.floor(place[0] + float(j - 1) * lights.shadow_softness))
-            row = wp.clamp(row, 0, rows - 1)
-            column = wp.clamp(column, 0, columns - 1)
-            word = lights.shadow_words[row, column]
-            if face_from(word) < 0 or place[2] < depth_from(word) + 0.008:
+            word = lights.shadow_words[int(y + float(i - 1) * reach), int(x + float(j - 1) * reach)]
+            if nearest < depth_from(word):  # an empty word reads as a depth without end
                 light += 1.0 / 9.0
     return light
 
