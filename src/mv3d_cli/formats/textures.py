@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -31,6 +33,11 @@ class TextureFiles:
 
     mesh: Path
     decoded: dict[object, UInt8[np.ndarray, "height width 4"] | None] = field(default_factory=dict)
+    ahead: dict[object, Future] = field(default_factory=dict)
+
+    def decode_ahead(self, pictures: Iterable[Path], pool: Executor) -> None:
+        """Begin to decode pictures that will be asked for; what is wrong with them is told then."""
+        self.ahead.update({picture: pool.submit(_pixels_of, picture, picture.name) for picture in pictures})
 
     def pixels(self, key: object, source: Path | bytes | None, label: str) -> np.ndarray | None:
         """RGBA pixels [height, width, 4] of the file or bytes `source`, remembered under `key`.
@@ -45,8 +52,8 @@ class TextureFiles:
         try:
             if source is None:
                 raise MissingInput("it was not found.", "")
-            data = source if isinstance(source, bytes) else read_bytes(source)
-            pixels, (width, height) = decode_reduced(data, label, MAX_TEXTURE_SIDE)
+            begun = self.ahead.get(source)
+            pixels, (width, height) = begun.result() if begun else _pixels_of(source, label)
         except (MissingInput, BadImage) as error:
             self.warn(f"texture {label} is replaced by grey: {error}")
             return None
@@ -57,3 +64,9 @@ class TextureFiles:
     def warn(self, message: str) -> None:
         """Say what of this mesh is not as its author meant it."""
         warnings.warn(f"{self.mesh}: {message}", MeshWarning, stacklevel=2)
+
+
+def _pixels_of(source: Path | bytes, label: str) -> tuple[UInt8[np.ndarray, "height width 4"], tuple[int, int]]:
+    """RGBA pixels, reduced if need be, and the size before. Raises MissingInput or BadImage."""
+    data = source if isinstance(source, bytes) else read_bytes(source)
+    return decode_reduced(data, label, MAX_TEXTURE_SIDE)

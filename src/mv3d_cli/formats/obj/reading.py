@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -25,13 +26,14 @@ from mv3d_cli.scene.mesh import Material, Mesh
 
 def read_obj(path: Path) -> Mesh:
     """The mesh in the file's own axes. Raises MissingInput or BadMesh; warns of what materials lack."""
-    check_readable(path)
-    with path.open("rb") as stream:
-        said = read_statements(stream)
-    _check_corners(said)
     files = TextureFiles(path)
-    entries = _entries(path, said, files)
-    materials = [_material(path, name, said, entries, files) for name in said.material_names]
+    sources = obj_sources(path)
+    with ThreadPoolExecutor(1) as beside, path.open("rb") as stream:
+        files.decode_ahead((source for source in sources if source.suffix.lower() != ".mtl"), beside)
+        said = read_statements(stream)
+        _check_corners(said)
+        entries = _entries(path, said, files)
+        materials = [_material(path, name, said, entries, files) for name in said.material_names]
     face_material = said.face_material
     if not said.face_material.size or said.face_material.min() < 0:
         materials.append(GREY_MATERIAL if said.colors is None else Material())

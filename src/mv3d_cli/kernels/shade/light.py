@@ -9,7 +9,7 @@ from __future__ import annotations
 import warp as wp
 
 from mv3d_cli.kernels.rasterize.footprint import Eye, in_camera, in_picture
-from mv3d_cli.kernels.rasterize.warp_kernels import depth_from, face_from
+from mv3d_cli.kernels.rasterize.warp_kernels import depth_from
 
 wp.set_module_options({"enable_backward": False})
 
