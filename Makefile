@@ -4,7 +4,7 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint bench clean
+.PHONY: help install blender demo test lint bench clean
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -18,6 +18,9 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e . --group dev
 	@touch $(STAMP)
+
+blender: $(STAMP)  ## add Blender, for --engine blender and its tests (Python 3.11)
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[blender]'
 
 demo: $(STAMP)  ## draw 16 objects of our own and print where they are
 	$(BIN)/mv3d render --procedural 16 --size 256 --lighting studio -o out/demo
