@@ -19,6 +19,8 @@ from mv3d_cli.steps import cache
 
 app = typer.Typer(name="cache", help="Look after the results that are kept.", no_args_is_help=True)
 
+SHOWN_INPUTS = 2
+
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for programs.")]
 
 
@@ -38,7 +40,7 @@ def list_entries(as_json: Json = False) -> None:
             step,
             _size(entry.size),
             _age(time.time() - entry.made),
-            " ".join(entry.inputs),
+            _shortened(entry.inputs),
         )
         table.add_row(*map(Text, cells))
     _console().print(table)
@@ -137,6 +139,13 @@ def _origin(origin: cache.Origin) -> Text:
 
 def _print_json(value: Any) -> None:
     typer.echo(json.dumps(value, indent=2, default=str))
+
+
+def _shortened(inputs: tuple[str, ...]) -> str:
+    """The first inputs, and how many more there are."""
+    shown = ", ".join(inputs[:SHOWN_INPUTS])
+    more = len(inputs) - SHOWN_INPUTS
+    return f"{shown} and {more} more" if more > 0 else shown
 
 
 def _size(count: int) -> str:
