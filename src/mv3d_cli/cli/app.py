@@ -20,6 +20,7 @@ from mv3d_cli.errors import Mv3dError, UsageError, WorkFailed
 
 COMMANDS = {
     "render": "Meshes become views: colour, depth and normals from a rig of cameras.",
+    "depth2normal": "Depth becomes normals: metric, filtered, sharp at silhouettes and steps.",
     "cache": "Look into and clean the cache of artifacts.",
 }
 
