@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from shared_data import in_unit_sphere, shared, table
 
 from mv3d_cli.capture.normals import normals_from_depth, paper_normals
 from mv3d_cli.capture.rendering import render
@@ -17,6 +16,7 @@ from mv3d_cli.formats.cameras import HORIZONTAL, load_cameras, select
 from mv3d_cli.formats.meshes import find_meshes, read_mesh
 from mv3d_cli.scene.camera import Camera
 from mv3d_cli.scene.conventions import normal_from_bytes
+from shared_data import in_unit_sphere, shared, table
 
 SIZE = 256
 RADIUS = 0.8
