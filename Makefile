@@ -4,7 +4,7 @@ BIN := .venv/bin
 STAMP := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help install blender demo test lint bench clean
+.PHONY: help install blender ray demo test lint bench clean
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -21,6 +21,9 @@ $(STAMP): pyproject.toml constraints.txt
 
 blender: $(STAMP)  ## add Blender, for --engine blender and its tests (Python 3.11)
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[blender]'
+
+ray: $(STAMP)  ## add Ray, for --workers ray and its tests
+	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[ray]'
 
 demo: $(STAMP)  ## draw 16 objects of our own and print where they are
 	$(BIN)/mv3d render --procedural 16 --size 256 --lighting studio -o out/demo

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from mv3d_cli.errors import BadMesh, Mv3dError, WorkFailed
-from mv3d_cli.mapping import map_items
+from mv3d_cli.mapping import map_items, map_on_ray
 
 # Workers import what they run by name, so these are spelled as files that they can find.
 WORK = """
@@ -57,6 +57,7 @@ def work(tmp_path_factory):
     (folder / "work_to_map.py").write_text(WORK)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(folder))
+        patch.setenv("PYTHONPATH", str(folder))  # for workers that are not ours to start
         import work_to_map  # pyright: ignore[reportMissingImports]
 
         yield work_to_map
@@ -133,3 +134,19 @@ def test_errors_travel_between_processes():
     for kind in [Mv3dError, *Mv3dError.__subclasses__(), BadMesh]:
         error = pickle.loads(pickle.dumps(kind("what is wrong", "what to do")))
         assert (type(error), str(error), error.hint) == (kind, "what is wrong", "what to do")
+
+
+def test_ray_gives_the_same_outcomes(work) -> None:
+    pytest.importorskip("ray", reason="ray is not installed")
+    outcomes = {outcome.item: outcome for outcome in map_on_ray(work.square, [3, -1, 13, 4])}
+    assert (outcomes[3].result, outcomes[4].result) == (9, 16)
+    assert isinstance(outcomes[-1].error, ValueError)
+    assert isinstance(outcomes[13].error, BadMesh)
+    assert outcomes[13].error.hint == "take another"
+
+
+def test_ray_survives_a_worker_that_dies(work) -> None:
+    pytest.importorskip("ray", reason="ray is not installed")
+    outcomes = {outcome.item: outcome for outcome in map_on_ray(work.fatal_kill, [1, 2, 3])}
+    assert (outcomes[1].result, outcomes[3].result) == (1, 3)
+    assert isinstance(outcomes[2].error, WorkFailed)

@@ -1,7 +1,8 @@
-"""Map over independent items: in this process, or over worker processes whose crash takes nobody along."""
+"""Map over independent items: here, over worker processes whose crash takes nobody along, or over a Ray cluster."""
 
 from __future__ import annotations
 
+import logging
 import multiprocessing
 import os
 import signal
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from mv3d_cli.errors import WorkFailed
+from mv3d_cli.errors import MissingDependency, WorkFailed
 
 AHEAD = 2  # items queued per worker, so that none waits and a crash leaves few to try again
 
@@ -50,6 +51,47 @@ def map_items(
     for item in suspects:  # a worker died: each item in flight gets a worker of its own, to find the culprit
         if (yield from _in_pool(function, [item], 1, initializer)):
             yield Outcome(item, error=WorkFailed("its worker process died", "it may need more memory; try --jobs 1"))
+
+
+def map_on_ray(
+    function: Callable[[Any], Any], items: Sequence[Any], initializer: Callable[[], None] | None = None
+) -> Iterator[Outcome]:
+    """As `map_items`, on the cluster that RAY_ADDRESS names, else on a Ray of this machine's own.
+
+    Workers elsewhere need mv3d installed and the same file system. Raises MissingDependency.
+    """
+    try:
+        import ray  # pyright: ignore[reportMissingImports]
+        from ray.exceptions import RayError, RayTaskError  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        hint = "pip install 'mv3d-cli[ray]', or take --workers processes"
+        raise MissingDependency("the package ray is not installed", hint) from None
+    ray.init(include_dashboard=False, log_to_driver=False, logging_level=logging.ERROR)
+    try:
+        attempt = ray.remote(max_retries=0)(_begin_and_attempt)
+        waiting, flying = list(reversed(items)), {}
+        room = AHEAD * max(int(ray.cluster_resources().get("CPU", 1)), 1)
+        while waiting or flying:
+            while waiting and len(flying) < room:
+                item = waiting.pop()
+                flying[attempt.remote(function, item, initializer)] = item
+            (ready,), _ = ray.wait(list(flying), num_returns=1)
+            item = flying.pop(ready)
+            try:
+                yield ray.get(ready)
+            except RayTaskError as error:  # an error of the work itself is an outcome: this is one before it
+                hint = "mv3d must be installed there, the same version, and see the same files"
+                yield Outcome(item, error=WorkFailed(f"its Ray worker could not begin: {error.cause}", hint))
+            except RayError:
+                yield Outcome(item, error=WorkFailed("its Ray worker died", "it may need more memory"))
+    finally:
+        ray.shutdown()
+
+
+def _begin_and_attempt(function: Callable[[Any], Any], item: Any, initializer: Callable[[], None] | None) -> Outcome:
+    if initializer is not None:
+        initializer()
+    return _attempt(function, item)
 
 
 def _attempt(function: Callable[[Any], Any], item: Any) -> Outcome:

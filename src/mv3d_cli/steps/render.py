@@ -19,6 +19,7 @@ VERSION = 1  # bumped when the same settings and inputs give other bytes
 
 Lighting = Literal["random", "studio", "none"]
 Engine = Literal["raster", "blender"]
+Workers = Literal["processes", "ray"]
 Device = Literal["cpu", "cuda"]
 Up = Literal["auto", "y", "z"]
 
@@ -39,6 +40,9 @@ class Config:
     engine: Annotated[Engine, Doc("Our rasteriser, or Blender Cycles (extra: blender).")] = "raster"
     samples: Annotated[int, Doc("Cycles samples a pixel."), Between(1, 4096)] = 32
     jobs: Annotated[int, Doc("Worker processes of a batch; 0: one per processor."), Between(0, 256), Runtime()] = 0
+    workers: Annotated[Workers, Doc("Of a batch: processes here, or the Ray cluster of RAY_ADDRESS."), Runtime()] = (
+        "processes"
+    )
     device: Annotated[Device, Doc("Where the rasteriser runs."), Runtime()] = "cpu"
 
 

@@ -6,7 +6,7 @@ import hashlib
 import json
 import shutil
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -26,16 +26,15 @@ from mv3d_cli.formats.images import read_image, write_png
 from mv3d_cli.formats.meshes import MeshFile, find_meshes, mesh_sources, read_mesh
 from mv3d_cli.formats.views_folder import write_views
 from mv3d_cli.kernels.runtime import cpu_count, in_threads, use_threads
-from mv3d_cli.mapping import Outcome, map_items
+from mv3d_cli.mapping import Outcome, map_items, map_on_ray
 from mv3d_cli.scene.camera import Camera
 from mv3d_cli.scene.mesh import Mesh, transform, unit_sphere_from_mesh
 from mv3d_cli.scene.views import Views
 from mv3d_cli.steps.settings import Progress, Tell, Warned
-from mv3d_cli.store import digest_of_file
+from mv3d_cli.store import digest_of_file, ran_out_of_space
 
 if TYPE_CHECKING:
     from mv3d_cli.steps.render import Config
-from mv3d_cli.store.disk import ran_out_of_space
 
 SHEET_OBJECTS = 64
 OUR_FILES = ("index.json", "failures.json", "sheet.png", "artifact.json")  # in a data-set folder, beside the objects
@@ -133,12 +132,11 @@ def render_all(config: Config, rig: Sequence[Camera], work: Sequence[Object], fo
     places = {_place(item, turn): (item, turn) for item in work for turn in turns}
     waiting = [place for place in places if not (folder / place).is_dir()]
     _sweep(folder)
-    jobs = min(config.jobs or cpu_count(), len(waiting))
     todo = [(place, *places[place]) for place in waiting]
     failed: list[Outcome] = []
     done = len(places) - len(waiting)
     draw = partial(_draw_into, config, tuple(rig), folder)
-    for outcome in map_items(draw, todo, max(jobs, 1), partial(use_threads, 1)):
+    for outcome in _outcomes(config, draw, todo):
         done += 1
         if outcome.error is not None:
             if _concerns_all(outcome.error):
@@ -149,6 +147,14 @@ def render_all(config: Config, rig: Sequence[Camera], work: Sequence[Object], fo
     failed.sort(key=lambda outcome: outcome.item[0])
     _check_drawn(failed, len(places))
     _finish(folder, places, [_failure(outcome) for outcome in failed], tell)
+
+
+def _outcomes(config: Config, draw: Callable[[Any], None], todo: Sequence[Any]) -> Iterator[Outcome]:
+    """What became of each object, drawn by the workers that the settings ask for."""
+    one_thread = partial(use_threads, 1)
+    if config.workers == "ray":
+        return map_on_ray(draw, todo, one_thread)
+    return map_items(draw, todo, max(min(config.jobs or cpu_count(), len(todo)), 1), one_thread)
 
 
 def _sweep(folder: Path) -> None:

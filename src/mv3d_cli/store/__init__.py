@@ -4,6 +4,7 @@ from mv3d_cli.store.artifact import Artifact, damage_of, find_artifact, is_intac
 from mv3d_cli.store.cache import cache_dir, maker_of
 from mv3d_cli.store.delivery import check_output, deliver
 from mv3d_cli.store.digest import digest_of_file, digest_of_folder, digest_of_path
+from mv3d_cli.store.disk import ran_out_of_space
 from mv3d_cli.store.production import produce
 from mv3d_cli.store.recipe import Recipe, canonical_json
 
@@ -23,4 +24,5 @@ __all__ = [
     "maker_of",
     "open_artifact",
     "produce",
+    "ran_out_of_space",
 ]
