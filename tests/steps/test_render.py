@@ -33,6 +33,7 @@ OTHER: dict[str, Any] = {
     "up": "z",
     "samples": 8,
     "jobs": 1,
+    "workers": "ray",
 }
 """Another value of each setting that the key may depend on; `cameras` is an input and `engine` needs Blender."""
 
