@@ -82,6 +82,14 @@ def test_one_mesh_and_a_data_set_of_it_have_keys_of_their_own(horse):
     assert (several.path / "horse" / "transforms.json").is_file()
 
 
+def test_a_folder_that_begins_like_a_scanned_object_loses_no_mesh(horse, tmp_path):
+    (tmp_path / "set" / "meshes").mkdir(parents=True)
+    (tmp_path / "set/meshes/model.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    shutil.copy(horse, tmp_path / "set/z.ply")
+    index = json.loads((run(TINY, [tmp_path / "set"]).path / "index.json").read_text())
+    assert len(index["objects"]) == 2
+
+
 def test_a_texture_belongs_to_the_key(tmp_path):
     (tmp_path / "a.obj").write_text("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n")
     (tmp_path / "a.mtl").write_text("newmtl m\nKd 1 0 0\n")

@@ -61,7 +61,7 @@ def run(config: Config, inputs: Sequence[Path], tell: Tell = silent) -> Artifact
     if config.cameras is not None:
         digests["cameras"] = digest_of_file(config.cameras)
     sources = {item.label: str(item.source) for item in work if item.source is not None}
-    batch = objects.is_batch(config, inputs)
+    batch = objects.is_batch(config, inputs, work)
     recipe = Recipe("render", VERSION, key_config(config) | {"batch": batch}, digests, sources=sources)
     if batch:
         build = partial(objects.render_all, config, rig, work, tell=tell)

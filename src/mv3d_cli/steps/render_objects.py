@@ -70,13 +70,6 @@ def check_device(config: Config) -> None:
         raise UsageError("--device cuda: there is no CUDA device here", "leave it out to render on the processor")
 
 
-def is_batch(config: Config, inputs: Sequence[Path]) -> bool:
-    """Whether a data set is wanted, if only of one object. A scanned object's folder counts as one mesh."""
-    folders = [path for path in inputs if path.is_dir()]
-    several = len(inputs) > 1 or config.rotations > 0 or config.procedural > 0
-    return several or any(find_meshes(path)[0].path != path / "meshes" / "model.obj" for path in folders)
-
-
 def work_of(config: Config, inputs: Sequence[Path]) -> list[Object]:
     """Every object to draw, names unique, in order. Raises UsageError, MissingInput."""
     if not inputs and not config.procedural:
@@ -88,6 +81,14 @@ def work_of(config: Config, inputs: Sequence[Path]) -> list[Object]:
     return found + [
         Object(name, f"procedural:{seed}", seed=seed) for name, seed in zip(names[len(files) :], seeds, strict=True)
     ]
+
+
+def is_batch(config: Config, inputs: Sequence[Path], work: Sequence[Object]) -> bool:
+    """Whether a data set is wanted, if only of one object. A scanned object's folder counts as one mesh."""
+    found = {item.source for item in work}
+    folders = [path for path in inputs if path.is_dir() and path / "meshes" / "model.obj" not in found]
+    several = len(inputs) > 1 or len(work) > 1 or config.rotations > 0 or config.procedural > 0
+    return several or bool(folders)
 
 
 def _unique(names: Iterable[str]) -> list[str]:
