@@ -7,12 +7,9 @@ Linear colour is read back and turned to sRGB here: what is white to `rendering`
 
 from __future__ import annotations
 
-import ctypes
 import importlib
-import os
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -22,7 +19,7 @@ from jaxtyping import Float32, UInt8
 
 from mv3d_cli.capture.blender_scene import add_eye, add_light, add_mesh, aim
 from mv3d_cli.errors import MissingDependency, WorkFailed
-from mv3d_cli.kernels.runtime import threads
+from mv3d_cli.kernels.runtime import discarded, threads
 from mv3d_cli.kernels.shade import Light
 from mv3d_cli.scene.camera import Camera
 from mv3d_cli.scene.conventions import bytes_from_normal, srgb_from_linear
@@ -40,7 +37,7 @@ def render(mesh: Mesh, cameras: Sequence[Camera], size: int, light: Light | None
 
     Raises MissingDependency without the package `bpy`, WorkFailed when Blender gives up.
     """
-    with _silence(), TemporaryDirectory(prefix="mv3d-blender-") as folder:
+    with discarded(1), TemporaryDirectory(prefix="mv3d-blender-") as folder:
         bpy = _blender()
         try:
             bpy.ops.wm.read_factory_settings(use_empty=True)
@@ -64,24 +61,6 @@ def _blender() -> Any:
             "pip install 'mv3d-cli[blender]'; bpy 4.2.0 needs Python 3.11, yours is "
             f"{sys.version_info.major}.{sys.version_info.minor}; or try --engine raster",
         ) from None
-
-
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Blender's chatter goes nowhere: it writes to file descriptor 1, which belongs to our result."""
-    libc = ctypes.CDLL("ucrtbase" if os.name == "nt" else None)
-    sys.stdout.flush()
-    libc.fflush(None)
-    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    try:
-        yield
-    finally:
-        sys.stdout.flush()
-        libc.fflush(None)
-        os.dup2(kept, 1)
-        os.close(kept)
-        os.close(nowhere)
 
 
 def _settings(scene: Any, size: int, path: Path) -> None:

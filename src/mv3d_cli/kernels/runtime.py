@@ -7,8 +7,10 @@ parts of its domain to a pool of threads. CUDA launches take the whole domain at
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
-from collections.abc import Callable, Iterable
+import sys
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 from functools import cache
@@ -20,18 +22,32 @@ import numpy as np
 import warp as wp
 
 
+@contextlib.contextmanager
+def discarded(descriptor: int) -> Iterator[None]:
+    """What libraries write to a file descriptor past Python goes nowhere: 1 belongs to results, 2 to our words."""
+    kept, nowhere = os.dup(descriptor), os.open(os.devnull, os.O_WRONLY)
+    _flush()
+    os.dup2(nowhere, descriptor)
+    try:
+        yield
+    finally:
+        _flush()
+        os.dup2(kept, descriptor)
+        os.close(kept)
+        os.close(nowhere)
+
+
+def _flush() -> None:
+    """Empties the buffers of Python's standard output and of the C library."""
+    sys.stdout.flush()
+    ctypes.CDLL("ucrtbase" if os.name == "nt" else None).fflush(None)
+
+
 def _start_quietly() -> None:
     """Starts Warp, whose C side writes to standard error where there is no CUDA driver."""
     wp.config.log_level = wp.LOG_WARNING
-    with contextlib.suppress(OSError):
-        kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-        try:
-            os.dup2(nowhere, 2)
-            wp.init()
-        finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-            os.close(nowhere)
+    with contextlib.suppress(OSError), discarded(2):
+        wp.init()
 
 
 _start_quietly()
