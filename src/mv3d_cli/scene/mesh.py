@@ -73,3 +73,10 @@ def unit_sphere_from_mesh(mesh: Mesh) -> Float[np.ndarray, "4 4"]:
     similarity = np.diag([scale, scale, scale, 1.0])
     similarity[:3, 3] = -scale * centre
     return similarity
+
+
+def face_normals(mesh: Mesh) -> Float[np.ndarray, "faces 3"]:
+    """Unit normals of the faces (zero where a face has no area)."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]].astype(np.float64) for i in range(3))
+    cross = np.cross(b - a, c - a)
+    return cross / np.maximum(np.linalg.norm(cross, axis=1, keepdims=True), 1e-300)
