@@ -1,0 +1,1 @@
+"""Field to mesh: surface extraction, repair, simplification, unwrapping and texture baking."""

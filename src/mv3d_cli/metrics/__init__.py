@@ -1,0 +1,1 @@
+"""Pure numbers: how alike two pictures, two depth maps, two shapes are."""
