@@ -205,3 +205,50 @@ def test_a_mesh_by_another_name_is_not_read(tmp_path, box):
     shutil.copy(tmp_path / "a.stl", tmp_path / "a.glb")
     with pytest.raises(BadMesh, match="not glTF"):
         read_mesh(MeshFile("a", tmp_path / "a.glb"))
+
+
+TEXTURED_PLY = """ply
+format ascii 1.0
+comment TextureFile {picture}
+element vertex 3
+property float x
+property float y
+property float z
+property float {u}
+property float {v}
+property uchar red
+property uchar green
+property uchar blue
+element face 1
+property list uchar int vertex_indices
+end_header
+0 0 0 0 1 10 20 30
+1 0 0 1 1 10 20 30
+1 1 0 1 0 10 20 30
+3 0 1 2
+"""
+
+
+@pytest.mark.parametrize("names", [("s", "t"), ("u", "v"), ("texture_u", "texture_v")])
+def test_another_program_s_textured_ply(Builder, tmp_path, names):
+    (tmp_path / "my skin.png").write_bytes(Builder.png())
+    path = tmp_path / "a.ply"
+    path.write_text(TEXTURED_PLY.format(picture="my skin.png", u=names[0], v=names[1]))
+    mesh = read_mesh(MeshFile("a", path))
+    assert mesh.uvs.tolist() == [[0, 0], [1, 0], [1, 1]]
+    assert mesh.materials[0].texture.pixels[0, 0].tolist() == [200, 100, 50, 255]
+    assert mesh.colors is None, "the picture is shown, not both"
+    assert mesh_sources(MeshFile("a", path)) == [path, tmp_path / "my skin.png"]
+
+
+@pytest.mark.parametrize("picture", ["none.png", "../../secret.png"])
+def test_a_ply_s_picture_that_is_not_there_or_not_its_own(Builder, tmp_path, picture):
+    folder = tmp_path / "a" / "b"
+    folder.mkdir(parents=True)
+    (tmp_path / "secret.png").write_bytes(Builder.png())
+    (folder / "a.ply").write_text(TEXTURED_PLY.format(picture=picture, u="s", v="t"))
+    with pytest.warns(UserWarning, match="replaced"):
+        mesh = read_mesh(MeshFile("a", folder / "a.ply"))
+    assert mesh.materials[0].texture is None
+    assert mesh.colors is not None
+    assert mesh_sources(MeshFile("a", folder / "a.ply")) == [folder / "a.ply"]

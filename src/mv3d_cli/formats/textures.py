@@ -1,11 +1,11 @@
-"""Textures of meshes: at most 4096 pixels a side, and replaced by grey where they cannot be had."""
+"""Textures of meshes: read at most 4096 pixels a side, and replaced by grey where they cannot be had."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from jaxtyping import UInt8
 
 from mv3d_cli.errors import BadImage, MissingInput
 from mv3d_cli.formats.images import decode_reduced, read_bytes
-from mv3d_cli.scene.conventions import linear_from_srgb
+from mv3d_cli.scene.conventions import linear_from_srgb, srgb_from_linear
 from mv3d_cli.scene.mesh import Material
 
 MAX_TEXTURE_SIDE = 4096
@@ -64,6 +64,38 @@ class TextureFiles:
     def warn(self, message: str) -> None:
         """Say what of this mesh is not as its author meant it."""
         warnings.warn(f"{self.mesh}: {message}", MeshWarning, stacklevel=2)
+
+
+def stored_pictures(
+    materials: Iterable[Material],
+) -> tuple[list[UInt8[np.ndarray, "height width channels"]], list[int | None]]:
+    """The distinct pictures of some materials, RGB where alpha says nothing, and which of them each material has."""
+    pictures: list[np.ndarray] = []
+    numbers: dict[tuple[int, bool], int] = {}
+    chosen: list[int | None] = []
+    for material in materials:
+        if material.texture is None:
+            chosen.append(None)
+            continue
+        pixels, opaque = material.texture.pixels, material.alpha_mode == "opaque"
+        number = numbers.setdefault((id(pixels), opaque), len(pictures))
+        if number == len(pictures):
+            pictures.append(pixels[..., :3] if opaque or (pixels[..., 3] == 255).all() else pixels)
+        chosen.append(number)
+    return pictures, chosen
+
+
+def tinted(material: Material) -> Material:
+    """The material with its base colour (not its alpha) inside its picture, for formats that show a picture alone."""
+    *color, alpha = material.base_color
+    if material.texture is None or color == [1, 1, 1]:
+        return material
+    levels = linear_from_srgb(np.arange(256) / 255)[:, None] * np.array(color)
+    table = np.round(srgb_from_linear(levels.clip(0, 1)) * 255).astype(np.uint8)
+    pixels = material.texture.pixels.copy()
+    for channel in range(3):
+        pixels[..., channel] = table[pixels[..., channel], channel]
+    return replace(material, base_color=(1.0, 1.0, 1.0, alpha), texture=replace(material.texture, pixels=pixels))
 
 
 def _pixels_of(source: Path | bytes, label: str) -> tuple[UInt8[np.ndarray, "height width 4"], tuple[int, int]]:

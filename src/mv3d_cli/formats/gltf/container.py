@@ -22,7 +22,7 @@ _SUPPORTED = {
     "KHR_draco_mesh_compression", "KHR_mesh_quantization", "KHR_texture_transform", "EXT_texture_webp",
     "KHR_lights_punctual",
 }  # fmt: skip
-_JSON_CHUNK, _BINARY_CHUNK = 0x4E4F534A, 0x004E4942
+JSON_CHUNK, BINARY_CHUNK = 0x4E4F534A, 0x004E4942
 _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 
 
@@ -143,6 +143,6 @@ def _chunks(data: memoryview) -> tuple[memoryview, memoryview | None]:
             raise BadMesh("it is truncated inside a chunk.", "Copy or export the file again.")
         found.setdefault(kind, data[offset + 8 : offset + 8 + size])
         offset += 8 + size + (-size % 4)
-    if _JSON_CHUNK not in found:
+    if JSON_CHUNK not in found:
         raise BadMesh("it has no JSON chunk.", "Copy or export the file again.")
-    return found[_JSON_CHUNK], found.get(_BINARY_CHUNK)
+    return found[JSON_CHUNK], found.get(BINARY_CHUNK)
