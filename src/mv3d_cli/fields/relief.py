@@ -20,6 +20,8 @@ from mv3d_cli.scene.camera import Camera, Perspective, pixel_from_camera
 from mv3d_cli.scene.views import View, Views
 
 EDGE = 2.0  # pixels' widths: neighbours further off the fitted plane hardly count
+SIGMA = 2.0  # pixels: how far rough depth is smoothed
+ROUGH = 0.05  # of EDGE: depth that is further off its smooth planes is rough
 STEP = 12.0  # pixels' widths of depth across three pixels: more is a step, not a slope
 
 Picture = Float32[np.ndarray, "height width"]
@@ -56,18 +58,18 @@ class Relief:
         return 1 / float(pixel_from_camera(self.camera, self.shape[1], self.shape[0])[0, 0])
 
 
-def reliefs_of(views: Views, *, sigma: float = 1.0) -> tuple[Relief, ...]:
-    """The views as reliefs; depth is smoothed over planes by `sigma` pixels."""
-    return tuple(in_threads([partial(relief_of, view, sigma=sigma) for view in views.frames]))
+def reliefs_of(views: Views) -> tuple[Relief, ...]:
+    """The views as reliefs."""
+    return tuple(in_threads([partial(relief_of, view) for view in views.frames]))
 
 
-def relief_of(view: View, *, sigma: float = 1.0) -> Relief:
-    """One view as a relief."""
+def relief_of(view: View) -> Relief:
+    """One view as a relief; its depth is smoothed over planes where it is rough."""
     mask = mask_of(view)
     depth = slope = None
     smooth = np.zeros(view.shape, dtype=bool)
     if view.depth is not None and known(view.depth).any():
-        depth, slope, smooth = _surface(view, sigma)
+        depth, slope, smooth = _surface(view)
     color = None
     if view.color is not None:
         solid = cv2.erode(mask.astype(np.uint8), np.ones((3, 3))) > 0 if mask is not None else np.ones(view.shape, bool)
@@ -121,7 +123,7 @@ def lookup(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return above * (1 - v) + below * v
 
 
-def _surface(view: View, sigma: float) -> tuple[Picture, np.ndarray, np.ndarray]:
+def _surface(view: View) -> tuple[Picture, np.ndarray, np.ndarray]:
     """Smooth depth, its slopes, and where they can be trusted."""
     assert view.depth is not None
     valid = known(view.depth)
@@ -131,7 +133,9 @@ def _surface(view: View, sigma: float) -> tuple[Picture, np.ndarray, np.ndarray]
     heights = 1 / solid if perspective else solid
     # a pixel spans width * z under a pinhole, which is width / z of 1 / z
     tolerance = EDGE * width * (heights if perspective else np.ones_like(heights))
-    heights, right, down = fitted_planes(heights, valid, tolerance, sigma)
+    planes = fitted_planes(heights, valid, tolerance, SIGMA)
+    rough = np.median((np.abs(planes[0] - heights) / tolerance)[valid]) > ROUGH
+    heights, right, down = planes if rough else fitted_planes(heights, valid, tolerance, 0)
     if perspective:
         heights = 1 / np.maximum(heights, 1e-9)
         right, down = -right * heights**2, -down * heights**2

@@ -1,8 +1,8 @@
 """Views that disagree are aligned to each other: every view is warped a little until all show one surface.
 
-Points of each view are held against the surface, the outline and the colours of every other view that sees them; Gauss-Newton
-with reweighting finds all warps at once (non-rigid ICP, point to plane: Chen and Medioni, 1991). Smoothness is the
-prior of a Gaussian process, so that what the views cannot tell stays as it was.
+Points of each view are held against the surface, the outline and the colours of every other view that sees them;
+Gauss-Newton with reweighting finds all warps at once (non-rigid ICP, point to plane: Chen and Medioni, 1991).
+Smoothness is the prior of a Gaussian process, so that what the views cannot tell stays as it was.
 """
 
 from __future__ import annotations
