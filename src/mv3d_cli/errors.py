@@ -12,6 +12,7 @@ Mv3dError                    the root; `str(error)` is the line, `error.hint` th
 `- WorkFailed       exit 1   the input was fine and the work did not succeed
    |- OutOfSpace             the disk is full, or a size limit was met
    |- DamagedArtifact        an artifact whose bytes are not what its manifest says
+   |- EmptySurface           a field that is nowhere inside the object, so that no mesh can be made of it
    `- MissingDependency      an optional package that this request needs
 """
 
@@ -75,6 +76,10 @@ class OutOfSpace(WorkFailed):
 
 class DamagedArtifact(WorkFailed):
     """An artifact whose bytes are not what its manifest says."""
+
+
+class EmptySurface(WorkFailed):
+    """A field that is nowhere inside the object, so that no mesh can be made of it."""
 
 
 class MissingDependency(WorkFailed):

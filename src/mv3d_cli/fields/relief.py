@@ -20,8 +20,7 @@ from mv3d_cli.scene.camera import Camera, Perspective, pixel_from_camera
 from mv3d_cli.scene.views import View, Views
 
 EDGE = 2.0  # pixels' widths: neighbours further off the fitted plane hardly count
-SIGMA = 2.0  # pixels: how far rough depth is smoothed
-ROUGH = 0.05  # of EDGE: depth that is further off its smooth planes is rough
+SIGMA = 1.5  # pixels: how far measured or generated depth is smoothed; rendered depth is exact
 STEP = 12.0  # pixels' widths of depth across three pixels: more is a step, not a slope
 
 Picture = Float32[np.ndarray, "height width"]
@@ -64,7 +63,7 @@ def reliefs_of(views: Views) -> tuple[Relief, ...]:
 
 
 def relief_of(view: View) -> Relief:
-    """One view as a relief; its depth is smoothed over planes where it is rough."""
+    """One view as a relief; its depth is smoothed over planes unless it was rendered."""
     mask = mask_of(view)
     depth = slope = None
     smooth = np.zeros(view.shape, dtype=bool)
@@ -133,9 +132,8 @@ def _surface(view: View) -> tuple[Picture, np.ndarray, np.ndarray]:
     heights = 1 / solid if perspective else solid
     # a pixel spans width * z under a pinhole, which is width / z of 1 / z
     tolerance = EDGE * width * (heights if perspective else np.ones_like(heights))
-    planes = fitted_planes(heights, valid, tolerance, SIGMA)
-    rough = np.median((np.abs(planes[0] - heights) / tolerance)[valid]) > ROUGH
-    heights, right, down = planes if rough else fitted_planes(heights, valid, tolerance, 0)
+    sigma = 0 if view.source == "rendered" else SIGMA
+    heights, right, down = fitted_planes(heights, valid, tolerance, sigma)
     if perspective:
         heights = 1 / np.maximum(heights, 1e-9)
         right, down = -right * heights**2, -down * heights**2
