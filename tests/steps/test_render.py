@@ -18,7 +18,7 @@ from mv3d_cli.errors import UsageError
 from mv3d_cli.formats.meshes import read_mesh
 from mv3d_cli.formats.views_folder import read_views
 from mv3d_cli.steps.render import Config, run
-from mv3d_cli.steps.render_objects import random_turn, work_of
+from mv3d_cli.steps.render.objects import random_turn, work_of
 from mv3d_cli.steps.settings import Runtime, Warned, settings_of
 
 TINY = Config(size=16, lighting="none", views=("front",))

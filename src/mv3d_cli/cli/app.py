@@ -21,6 +21,8 @@ from mv3d_cli.errors import Mv3dError, UsageError, WorkFailed
 COMMANDS = {
     "render": "Meshes become views: colour, depth and normals from a rig of cameras.",
     "depth2normal": "Depth becomes normals: metric, filtered, sharp at silhouettes and steps.",
+    "fit-sdf": "Views become a textured mesh: aligned, fused, refined by a neural signed distance field.",
+    "export": "Meshes and fits into glb, obj, ply or stl: simplified, coloured, to a height in millimetres.",
     "cache": "Look into and clean the cache of artifacts.",
 }
 
@@ -39,7 +41,7 @@ class LazyGroup(TyperGroup):
             return None
         if "--help" in sys.argv[1:2]:
             return TyperCommand(cmd_name, help=COMMANDS[cmd_name])
-        module = importlib.import_module(f"mv3d_cli.cli.{cmd_name}")
+        module = importlib.import_module(f"mv3d_cli.cli.{cmd_name.replace('-', '_')}")
         command = get_command(module.app)
         command.name = cmd_name
         return command

@@ -13,6 +13,7 @@ from functools import partial
 
 import numpy as np
 import scipy.linalg
+import torch
 
 from mv3d_cli.fields.alignment.correspondence import Rows, Samples, rows_between, samples_of
 from mv3d_cli.fields.alignment.warps import GRID, Warp, still
@@ -21,7 +22,7 @@ from mv3d_cli.kernels.runtime import in_threads
 
 GATES = (0.12, 0.08, 0.06, 0.04, 0.03, 0.03, 0.03)  # scene units: points further from the other view's surface wait
 PHOTOMETRIC_FROM = 3  # the round from which colours are close enough to be compared
-AGREE = 0.25  # pixels' widths: views that disagree less are left as they are
+AGREE = 0.1  # pixels' widths: views that disagree less are left as they are
 RIDGE = 1e-3  # white part of the prior, of its variance
 
 
@@ -38,7 +39,7 @@ class Prior:
 
 @dataclass(frozen=True)
 class Alignment:
-    """The warps of all views, and the mean disagreement in scene units before and after."""
+    """The warps of all views, and the median disagreement in scene units before and after."""
 
     warps: tuple[Warp, ...]
     before: float
@@ -64,9 +65,9 @@ def align(reliefs: Sequence[Relief], held: Sequence[bool], prior: Prior | None =
 
 
 def disagreement(reliefs: Sequence[Relief], sampled: dict[int, Samples], warps: Sequence[Warp]) -> float:
-    """Mean distance between what two views say of the same surface, scene units; NaN where no two see the same."""
+    """Median distance between what two views say of the same surface, scene units; NaN where no two see the same."""
     found = [rows.residual[: rows.geometric] for _, _, rows in _all_rows(reliefs, sampled, warps, GATES[0], False)]
-    return float(np.abs(np.concatenate(found)).mean()) if sum(map(len, found)) else float("nan")
+    return float(np.median(np.abs(np.concatenate(found)))) if sum(map(len, found)) else float("nan")
 
 
 def _all_rows(
@@ -96,9 +97,8 @@ class _System:
         found = _all_rows(self.reliefs, sampled, warps, gate, photometric)
         count, size = len(self.reliefs), self.size
         matrix, vector = np.zeros((count, size, count, size)), np.zeros((count, size))
-        for (i, j, _), (normal, gradient) in zip(
-            found, in_threads([partial(_normal_equations, rows) for _, _, rows in found]), strict=True
-        ):
+        for i, j, rows in found:  # one after the other: the matrix product has threads of its own
+            normal, gradient = _normal_equations(rows)
             for a, first in ((i, 0), (j, 1)):
                 vector[a] += gradient[first]
                 for b, second in ((i, 0), (j, 1)):
@@ -108,8 +108,9 @@ class _System:
             matrix[i, :, i] += precision
             vector[i] += precision @ state[i]
         total = count * size
-        solvable = matrix.reshape(total, total)[np.ix_(self.free, self.free)]
-        state.reshape(-1)[self.free] -= scipy.linalg.solve(solvable, vector.reshape(-1)[self.free], assume_a="pos")
+        solvable = torch.from_numpy(matrix.reshape(total, total)[np.ix_(self.free, self.free)])
+        right = torch.from_numpy(vector.reshape(-1)[self.free, None])
+        state.reshape(-1)[self.free] -= torch.cholesky_solve(right, torch.linalg.cholesky(solvable)).numpy()[:, 0]
         gains = _gains(found, count) if photometric else [warp.gain for warp in warps]
         return [_warp_of(values, gain) for values, gain in zip(state, gains, strict=True)]
 
@@ -117,13 +118,16 @@ class _System:
 def _normal_equations(rows: Rows) -> tuple[np.ndarray, np.ndarray]:
     """J^T W J as (2, size, 2, size) and J^T W r as (2, size), of the view with the points and of the other."""
     jacobian = np.concatenate([_jacobian(*part) for part in (rows.own, rows.other)], axis=1)
-    weighted = jacobian * rows.weight[:, None]
+    jacobian *= np.sqrt(rows.weight)[:, None]
     half = jacobian.shape[1] // 2
-    return (weighted.T @ jacobian).reshape(2, half, 2, half), (weighted.T @ rows.residual).reshape(2, half)
+    tensor, residual = torch.from_numpy(jacobian), torch.from_numpy(rows.residual * np.sqrt(rows.weight)).float()
+    normal, gradient = tensor.T @ tensor, tensor.T @ residual
+    return normal.numpy().reshape(2, half, 2, half), gradient.numpy().reshape(2, half)
 
 
 def _jacobian(slopes: np.ndarray, basis: np.ndarray, height: np.ndarray) -> np.ndarray:
     """(rows, size): slopes (rows, 3) along dx, dy, dz; basis (rows, grid^2); height above the rig's centre."""
+    slopes, height = slopes.astype(np.float32), height.astype(np.float32)
     along = [slopes[:, axis, None] * basis for axis in range(3)]
     return np.concatenate([*along, slopes[:, 2:] * height[:, None], slopes[:, 2:]], axis=1)
 

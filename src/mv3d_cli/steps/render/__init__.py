@@ -52,7 +52,7 @@ def run(config: Config, inputs: Sequence[Path], tell: Tell = silent) -> Artifact
     Raises UsageError, MissingInput, BadMesh, BadCameras; in a batch a bad mesh is an entry of failures.json.
     """
     check(config)
-    from mv3d_cli.steps import render_objects as objects
+    from mv3d_cli.steps.render import objects
 
     objects.check_device(config)
     rig = objects.rig_of(config)
