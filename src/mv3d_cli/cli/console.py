@@ -48,9 +48,10 @@ def _print(label: str, style: str, text: str) -> None:
 def progress_bar() -> Iterator[Tell]:
     """What a step tells becomes a bar with rate and time left (after two seconds), and warnings."""
     rate = TextColumn("{task.fields[rate]}")
-    columns = [BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), rate, TimeElapsedColumn()]
+    note = TextColumn("{task.fields[note]}")
+    columns = [BarColumn(), MofNCompleteColumn(), TextColumn("{task.description}"), note, rate, TimeElapsedColumn()]
     bar = Bar(*columns, TextColumn("left"), TimeRemainingColumn(), console=stderr, transient=True)
-    task = bar.add_task("", total=None, rate="")
+    task = bar.add_task("", total=None, rate="", note="")
 
     def tell(event: Progress | Warned) -> None:
         if isinstance(event, Warned):
@@ -58,7 +59,7 @@ def progress_bar() -> Iterator[Tell]:
             return
         elapsed = bar.tasks[task].elapsed or 0.0
         rate = f"{event.done / elapsed:.1f} {event.unit}/s" if elapsed > 0 else ""
-        bar.update(task, completed=event.done, total=event.total, description=event.unit, rate=rate)
+        bar.update(task, completed=event.done, total=event.total, description=event.unit, rate=rate, note=event.note)
         if elapsed > PATIENCE and stderr.is_terminal and not bar.live.is_started:
             bar.start()
 

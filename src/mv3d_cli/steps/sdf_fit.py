@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 FIELD = "field.safetensors"
 VIEWS = "views"
+_FUSED = ("base", "origin", "voxel")  # of a field's state: made again from the views
 BAND = 3  # voxels beyond the fusion's reach in which the residual may have moved the surface
 
 
@@ -89,14 +90,20 @@ def fusion_of(fit: Fit, resolution: int | None = None, device: str = "cpu") -> t
 
 
 def field_of(fusion: Fusion, residual: dict[str, Tensor]) -> Field:
-    """The field that a fusion and a residual are."""
-    import torch
+    """The field that a fusion and a residual are. Raises DamagedArtifact for a residual that does not fit."""
+    from mv3d_cli.fields import sdf
 
-    from mv3d_cli.fields.sdf import Field
-
-    field = Field(torch.from_numpy(fusion.distance), torch.tensor(fusion.origin), fusion.voxel)
-    field.load_state_dict(residual, strict=False)
+    field = sdf.field_of(fusion)
+    try:
+        field.load_state_dict(field.state_dict() | residual)
+    except RuntimeError as error:
+        raise DamagedArtifact(f"the fit's weights do not fit ({error})", "make the fit again") from None
     return field.eval()
+
+
+def residual_of(field: Field) -> dict[str, Tensor]:
+    """What was trained of a field: all but the fusion that it stands on."""
+    return {name: value.detach().cpu() for name, value in field.state_dict().items() if name not in _FUSED}
 
 
 def mesh_of_fit(folder: Path, settings: MeshSettings) -> Mesh:
@@ -125,11 +132,12 @@ def _surface(fit: Fit, resolution: int | None) -> Mesh:
         _, fusion = fusion_of(fit, resolution)
         return surface_of_grid(fusion.distance, np.array(fusion.origin), fusion.voxel)
     _, fusion = fusion_of(fit)
-    distance_of = _distance_of(field_of(fusion, fit.residual))
+    field = field_of(fusion, fit.residual)
+    distance_of = _distance_of(field)
     if resolution is not None and resolution != fit.resolution:
         last = np.array(fusion.origin) + fusion.voxel * (np.array(fusion.distance.shape) - 1)
         return surface_of_field(distance_of, np.stack([np.array(fusion.origin), last]), resolution)
-    distance, near = fusion.distance.copy(), np.argwhere(_band(fusion)).astype(np.int16)
+    distance, near = field.base.numpy().copy(), np.argwhere(_band(fusion)).astype(np.int16)
     origin = np.array(fusion.origin, dtype=np.float32)
     for part in np.array_split(near, max(1, len(near) // 2**18)):
         distance[tuple(part.T)] = distance_of(origin + np.float32(fusion.voxel) * part)

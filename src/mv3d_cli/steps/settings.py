@@ -42,11 +42,12 @@ class Runtime:
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a step has come."""
+    """How far a step has come; `note`: what it can say of the result so far."""
 
     done: int
     total: int
     unit: str
+    note: str = ""
 
 
 @dataclass(frozen=True)

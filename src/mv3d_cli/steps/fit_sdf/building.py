@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import os
+import time
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from mv3d_cli.errors import MissingInput, UsageError
+import numpy as np
+
+from mv3d_cli.errors import MissingInput, UsageError, WorkFailed
 from mv3d_cli.steps.fit_sdf.checking import self_check, turntable, warnings_of
-from mv3d_cli.steps.sdf_fit import FIELD, VIEWS, Fit, MeshSettings, framed, mesh_of, write_fit
-from mv3d_cli.steps.settings import Tell, Warned
+from mv3d_cli.steps.sdf_fit import FIELD, VIEWS, Fit, MeshSettings, framed, fusion_of, mesh_of, residual_of, write_fit
+from mv3d_cli.steps.settings import Progress, Tell, Warned
 from mv3d_cli.steps.views_input import check_fittable, views_and_digest
 from mv3d_cli.store import digest_of_folder
 
@@ -19,7 +23,7 @@ if TYPE_CHECKING:
     from mv3d_cli.steps.fit_sdf import Config
 
 CHECKPOINT = "checkpoint.pt"
-EVERY = 5.0  # seconds between checkpoints
+EVERY = 2.0  # seconds between checkpoints
 QUICK_TEXTURE = 512
 
 
@@ -84,7 +88,8 @@ def build(config: Config, views: Views, tell: Tell, work: Path) -> None:
     write_png(work / "sheet.png", turntable(mesh, fit))
     for text in warnings_of(report):
         tell(Warned(text))
-    (work / CHECKPOINT).unlink(missing_ok=True)
+    for leftover in work.glob("checkpoint.*"):
+        leftover.unlink()
 
 
 def fitted(config: Config, views: Views, tell: Tell, work: Path) -> Fit:
@@ -100,3 +105,50 @@ def fitted(config: Config, views: Views, tell: Tell, work: Path) -> Fit:
     if config.quick or not config.steps:
         return fit
     return _refined(config, fit, tell, work)
+
+
+def _refined(config: Config, fit: Fit, tell: Tell, work: Path) -> Fit:
+    """The fit with a trained residual; goes on from a checkpoint, and leaves them as it goes."""
+    from mv3d_cli.fields import fitting, sdf
+
+    aligned, fusion = fusion_of(fit)
+    field = sdf.field_of(fusion, seed=config.seed).to(config.device)
+    training = fitting.Fit(field, aligned, fitting.Config(steps=config.steps, seed=config.seed))
+    spent = _resumed(training, work / CHECKPOINT)
+    started = saved = time.monotonic()
+    for done in training.run():
+        tell(Progress(done.step, done.steps, "steps", _said(done.losses)))
+        now = time.monotonic()
+        if not all(np.isfinite(loss) for loss in done.losses.values()):
+            raise WorkFailed(f"the fit diverged at step {done.step}", "try --steps 0, or another --seed")
+        if config.max_time is not None and spent + now - started > config.max_time:
+            break
+        if now - saved > EVERY:
+            _save(training, spent + now - started, work / CHECKPOINT)
+            saved = now
+    return replace(fit, residual=residual_of(field))
+
+
+def _said(losses: dict[str, float]) -> str:
+    """The losses in a few words."""
+    return " ".join(f"{name} {loss:.4f}" for name, loss in losses.items())
+
+
+def _save(training: Any, spent: float, path: Path) -> None:
+    """Writes a checkpoint whole, or leaves the one before."""
+    import torch
+
+    new = path.with_suffix(".new")
+    torch.save(training.state_dict() | {"spent": spent}, new)
+    os.replace(new, path)
+
+
+def _resumed(training: Any, path: Path) -> float:
+    """Goes on from a checkpoint of ours, if there is one; the seconds that were spent before."""
+    import torch
+
+    if not path.is_file():
+        return 0.0
+    state = torch.load(path, weights_only=True)
+    training.load_state_dict(state)
+    return float(state["spent"])
