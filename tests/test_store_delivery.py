@@ -215,3 +215,84 @@ for _ in range(15):
             assert racer.returncode == 0, said.decode()
     assert store.is_intact(store.open_artifact(tmp_path / "out" / "views"))
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["mesh.glb", "views"]
+
+
+COMPANIONS = ("mesh.mtl", "mesh.png", "mesh.2.png")
+
+
+def companied(text: str, *names: str) -> Artifact:
+    """An artifact whose main file refers to its companions; other files do not belong to it."""
+
+    def build(work: Path) -> None:
+        (work / "mesh").mkdir()
+        for name in ("mesh.obj", *names, "meshes.mtl", "other.png", "mesh/mesh.png"):
+            (work / name).write_text(f"{name} of {text}")
+
+    return produce(Recipe("export", 1, {"text": text, "names": names}, {}), build, main="mesh.obj")
+
+
+def test_companions_are_delivered_beside_the_main_file(tmp_path):
+    made, output = companied("first", *COMPANIONS), tmp_path / "deep" / "mesh.obj"
+    assert store.deliver(made, output) == output
+    assert contents(output.parent) == {n: f"{n} of first".encode() for n in ("mesh.obj", *COMPANIONS)}
+    before = {path: path.stat().st_ino for path in output.parent.iterdir()}
+    store.deliver(made, output)
+    assert {path: path.stat().st_ino for path in output.parent.iterdir()} == before
+    store.deliver(companied("second", *COMPANIONS), output)
+    assert contents(output.parent) == {n: f"{n} of second".encode() for n in ("mesh.obj", *COMPANIONS)}
+    for name in ("mesh.obj", *COMPANIONS):
+        made_by = store.maker_of(output.parent / name)
+        assert made_by is not None
+        assert (made_by["step"], made_by["part"]) == ("export", name)
+
+
+def test_companions_keep_the_names_by_which_they_are_referred_to(tmp_path):
+    store.deliver(companied("first", *COMPANIONS), tmp_path / "out" / "car.obj")
+    assert sorted(contents(tmp_path / "out")) == sorted(["car.obj", *COMPANIONS])
+    store.deliver(companied("first", *COMPANIONS), tmp_path / "folder")
+    assert "other.png" in contents(tmp_path / "folder")
+
+
+@pytest.mark.parametrize("name", ["mesh.obj", *COMPANIONS])
+@pytest.mark.parametrize("first", [False, True])
+def test_one_foreign_companion_refuses_all(tmp_path, name, first):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    if first:
+        store.deliver(companied("first", *COMPANIONS), folder / "mesh.obj")
+    (folder / name).write_text("theirs")
+    before = contents(folder)
+    with pytest.raises(errors.OutputRefused, match="not an untouched file of ours") as caught:
+        store.deliver(companied("second", *COMPANIONS), folder / "mesh.obj")
+    assert name in str(caught.value)
+    assert contents(folder) == before
+
+
+def test_a_failed_replacement_is_undone(tmp_path, monkeypatch):
+    output = tmp_path / "out" / "mesh.obj"
+    store.deliver(companied("first", "mesh.mtl"), output)
+    before, replace, replaced = contents(output.parent), Path.replace, []
+
+    def failing(path: Path, target: Path) -> Path:
+        if target == output:  # the last
+            raise OSError(5, "Input/output error")
+        replaced.append(target.name)
+        return replace(path, target)
+
+    monkeypatch.setattr(Path, "replace", failing)
+    with pytest.raises(errors.OutputRefused, match="Input/output"):
+        store.deliver(companied("second", "mesh.mtl", "mesh.png"), output)
+    assert {"mesh.mtl", "mesh.png"} <= set(replaced)
+    assert contents(output.parent) == before
+    assert sorted(path.name for path in output.parent.iterdir()) == ["mesh.mtl", "mesh.obj"]
+
+
+def test_companions_that_are_folders_or_links_are_theirs(tmp_path):
+    (tmp_path / "a" / "mesh.png").mkdir(parents=True)
+    (tmp_path / "a" / "mesh.png" / "mine").write_text("mine")
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "mesh.png").symlink_to(tmp_path / "nowhere")
+    for folder in ("a", "b"):
+        with pytest.raises(errors.OutputRefused):
+            store.deliver(companied("first", *COMPANIONS), tmp_path / folder / "mesh.obj")
+        assert os.listdir(tmp_path / folder) == ["mesh.png"]

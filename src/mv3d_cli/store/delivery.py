@@ -1,12 +1,18 @@
-"""The user's `-o`: a copy of an artifact, or of its main file, that replaces only what is ours."""
+"""The user's `-o`: a copy of an artifact, or of its main file, that replaces only what is ours.
+
+Files that lie beside the main file and share its stem are its companions (of mesh.obj: mesh.mtl, mesh.png,
+mesh.2.png). The main file may refer to them by name, so they are delivered beside the output under their own names.
+All are looked at before any is replaced; each is replaced at once, the main file last; after an error those that
+were replaced are put back.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from mv3d_cli.errors import OutOfSpace, OutputRefused
 from mv3d_cli.store.artifact import Artifact, damage_of
@@ -30,7 +36,7 @@ def check_output(output: Path, main: str | None = None) -> None:
 
 
 def deliver(artifact: Artifact, output: Path) -> Path:
-    """Copy an artifact, or its main file when `output` has that suffix, to where the user wants it.
+    """Copy an artifact, or its main file and companions when `output` has that suffix, to where the user wants it.
 
     What is there already is replaced when it is ours and untouched, and left alone when it is the same.
     Returns the output's path as given. Raises OutputRefused or OutOfSpace.
@@ -122,20 +128,56 @@ def _check_folder(target: Path, main: str | None) -> None:
 
 
 def _deliver_file(artifact: Artifact, target: Path) -> None:
-    """Copy the main file beside the target, then rename it over the target."""
-    main = artifact.manifest["main"]
-    sha256 = artifact.manifest["files"][main][0]
-    _check(target, main, expected=sha256)
-    if target.is_file() and sha256_of(target) == sha256:
+    """Copy the main file and its companions beside the target, then rename them into place."""
+    main, files = artifact.manifest["main"], artifact.manifest["files"]
+    sources = {target.with_name(PurePosixPath(name).name): name for name in _companions(artifact)} | {target: main}
+    for place, name in sources.items():
+        _check(place, name, expected=files[name][0])
+    changed = {place: name for place, name in sources.items() if not _holds(place, files[name][0])}
+    if not changed:
         return
-    remember_product(sha256, {**record_of(artifact.manifest), "part": main, "edited": False})
+    for name in changed.values():
+        remember_product(files[name][0], {**record_of(artifact.manifest), "part": name, "edited": False})
     target.parent.mkdir(parents=True, exist_ok=True)
     with _workplace(target) as workplace:
-        new = workplace / target.name
-        copy_file(artifact.path / main, new)
-        sync(new)
-        new.replace(target)
+        new, old = workplace / "new", workplace / "old"
+        new.mkdir()
+        old.mkdir()
+        for place, name in changed.items():
+            copy_file(artifact.path / name, new / place.name)
+            sync(new / place.name)
+        _replace(new, old, list(changed))
         sync(target.parent)
+
+
+def _companions(artifact: Artifact) -> list[str]:
+    """The artifact's files that belong to its main file."""
+    main = PurePosixPath(artifact.manifest["main"])
+    beside = [path for path in map(PurePosixPath, artifact.manifest["files"]) if path.parent == main.parent]
+    return [str(path) for path in beside if path != main and path.name.startswith(f"{main.stem}.")]
+
+
+def _holds(place: Path, sha256: str) -> bool:
+    return place.is_file() and sha256_of(place) == sha256
+
+
+def _replace(new: Path, old: Path, places: Sequence[Path]) -> None:
+    """Rename files of the folder `new` to their places, all or, after an error, none; `old` is for what was there."""
+    for place in places[:-1]:  # nothing can go wrong after the last
+        if place.exists():
+            copy_file(place, old / place.name)
+    done: list[Path] = []
+    try:
+        for place in places:
+            (new / place.name).replace(place)
+            done.append(place)
+    except OSError:
+        for place in done:
+            if (old / place.name).exists():
+                (old / place.name).replace(place)
+            else:
+                place.unlink()
+        raise
 
 
 def _deliver_folder(artifact: Artifact, target: Path) -> None:
@@ -188,8 +230,8 @@ def _prefix(target: Path) -> str:
 
 @contextmanager
 def _alone_at(target: Path) -> Iterator[None]:
-    """Let one process at a time look at an output or write it."""
-    place = cache_dir() / LAYOUT / ".outputs" / hashlib.sha256(os.fsencode(target)).hexdigest()
+    """Let one process at a time look at an output, or one of the same stem, or write it."""
+    place = cache_dir() / LAYOUT / ".outputs" / hashlib.sha256(os.fsencode(target.parent / target.stem)).hexdigest()
     with ExitStack() as stack:
         with suppress(OutputRefused):  # a cache that can only be read gives no locks
             stack.enter_context(locked(place, on_wait=lambda: None))
