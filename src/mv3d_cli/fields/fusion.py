@@ -39,14 +39,15 @@ def fuse(reliefs: Sequence[Relief], resolution: int = 192, disagreement: float =
     voxel = 2 * EXTENT / resolution
     reach = max(REACH * voxel, DOUBT * disagreement)
     first = -EXTENT + voxel / 2
+    origin = (first, first, first)
     pictures = [_picture(relief) for relief in reliefs]
-    distance = fuse_pictures(pictures, resolution, (first,) * 3, voxel, reach, device)
+    distance = fuse_pictures(pictures, resolution, origin, voxel, reach, device)
     if not (distance < 0).any():
         raise BadViews(
             "the views contradict each other: their silhouettes leave nothing of the object",
             "check that the cameras and masks belong together; a view can be left out with --weight NAME=0",
         )
-    return Fusion(distance, (first,) * 3, voxel, reach)
+    return Fusion(distance, origin, voxel, reach)
 
 
 def _picture(relief: Relief) -> Picture:

@@ -93,19 +93,20 @@ def mask_of(view: View) -> Bool[np.ndarray, "height width"] | None:
 
 def outline_of(view: View, mask: Bool[np.ndarray, "height width"]) -> Picture:
     """Signed distance to the mask's edge, pixels; between pixels where the alpha is antialiased."""
-    distance = distance_transform_edt(~mask) - distance_transform_edt(mask)
+    outer, inner = (np.asarray(distance_transform_edt(part)) for part in (~mask, mask))
+    distance = outer - inner
     distance -= np.sign(distance) * 0.5  # the edge runs half-way between pixel centres
     if view.color is not None and ((view.color[..., 3] > 0) & (view.color[..., 3] < 255)).any():
         covered = gaussian_filter(view.color[..., 3] / 255.0, 0.7)
-        steep = np.hypot(*np.gradient(covered))
-        finer = (0.5 - covered) / np.maximum(steep, 0.15)
+        down, right = np.gradient(covered)
+        finer = (0.5 - covered) / np.maximum(np.hypot(down, right), 0.15)
         distance = np.where(np.abs(distance) < 1, np.clip(finer, -1.5, 1.5), distance)
     return distance.astype(np.float32)
 
 
 def nearest(valid: Bool[np.ndarray, "height width"]) -> tuple[np.ndarray, np.ndarray]:
     """Row and column of the nearest valid pixel, of every pixel."""
-    rows, columns = distance_transform_edt(~valid, return_distances=False, return_indices=True)
+    rows, columns = np.asarray(distance_transform_edt(~valid, return_distances=False, return_indices=True))
     return rows, columns
 
 
@@ -146,7 +147,7 @@ def _surface(view: View) -> tuple[Picture, np.ndarray, np.ndarray]:
 
 def _extreme(depth: np.ndarray, valid: np.ndarray, sign: int) -> np.ndarray:
     """The least (-1) or greatest (1) known depth of the 3 x 3 pixels around each."""
-    return sign * cv2.dilate(np.where(valid, sign * depth, -1e3).astype(np.float32), np.ones((3, 3)))
+    return sign * cv2.dilate(np.where(valid, sign * depth, -1e30).astype(np.float32), np.ones((3, 3)))
 
 
 def _blurred_color(color: np.ndarray, valid: np.ndarray | None) -> Float32[np.ndarray, "height width 3"]:

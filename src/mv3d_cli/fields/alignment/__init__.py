@@ -90,6 +90,7 @@ class _System:
         self.precision = [_precision(prior, relief.shape) for relief in reliefs]
         free = np.ones((len(reliefs), self.size), dtype=bool)
         free[np.asarray(held), : 2 * GRID**2] = False
+        free[[relief.depth is None for relief in reliefs]] = False
         self.free = np.flatnonzero(free)
 
     def step(self, sampled: dict[int, Samples], warps: Sequence[Warp], gate: float, photometric: bool) -> list[Warp]:
@@ -140,7 +141,7 @@ def _precision(prior: Prior, shape: tuple[int, int]) -> np.ndarray:
     inverse = np.linalg.inv(np.exp(-apart / (2 * prior.reach**2)) + RIDGE * np.eye(len(place)))
     unit = shape[1] / 256  # errors are stated for pictures of 256 pixels
     parts = [inverse / (prior.pixels * unit) ** 2] * 2 + [inverse / prior.depth**2]
-    return scipy.linalg.block_diag(*parts, 1 / prior.scale**2, 1 / prior.shift**2)
+    return np.asarray(scipy.linalg.block_diag(*parts, 1 / prior.scale**2, 1 / prior.shift**2))
 
 
 def _vector_of(warp: Warp) -> np.ndarray:

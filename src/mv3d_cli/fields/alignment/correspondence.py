@@ -6,7 +6,7 @@ the warps (dx, dy, dz) of both views at the point. Axes and warps as in `warps`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from jaxtyping import Float
@@ -84,6 +84,9 @@ class _Part:
     other: np.ndarray
 
 
+_NOTHING = _Part(np.zeros(0, np.int64), *(np.zeros(shape, np.float32) for shape in (0, 0, (0, 3), (0, 3))))
+
+
 def samples_of(relief: Relief, grid: int) -> Samples:
     """Every few pixels of a relief that has depth."""
     assert relief.depth is not None
@@ -113,19 +116,14 @@ def rows_between(
             log_ratio = _log_ratio(samples.color[near], lookup(other.color, *seen.pixel[near].T))
     if other.outline is not None:
         parts.append(_outline_rows(seen, other))
-    which, residual, weight, own, theirs = (
-        np.concatenate([getattr(part, name) for part in parts]) if parts else np.zeros((0, 3)[: 1 + wide], kind)
-        for name, wide, kind in (
-            ("which", 0, np.int64), ("residual", 0, np.float32), ("weight", 0, np.float32),
-            ("own", 1, np.float32), ("other", 1, np.float32),
-        )
-    )  # fmt: skip
-    weight = weight * np.float32(relief.weight * other.weight)
+    rows = _Part(
+        *(np.concatenate([getattr(part, field.name) for part in (_NOTHING, *parts)]) for field in fields(_Part))
+    )
     return Rows(
-        residual,
-        weight,
-        (own, samples.basis[which], samples.depth[which] - RIG_RADIUS),
-        (theirs, seen.basis[which], _height_of(other, seen, which)),
+        rows.residual,
+        rows.weight * np.float32(relief.weight * other.weight),
+        (rows.own, samples.basis[rows.which], samples.depth[rows.which] - RIG_RADIUS),
+        (rows.other, seen.basis[rows.which], _height_of(other, seen, rows.which)),
         geometric,
         log_ratio,
     )
@@ -195,10 +193,12 @@ def _surface_rows(seen: _Seen, other: Relief, warp: Warp, gate: float) -> _Part:
     which = which[other.smooth[y[which].astype(int), x[which].astype(int)]]
     x, y = seen.pixel[which].T
     depth, slope = lookup(other.depth, x, y), other.slope[y.astype(int), x.astype(int)]
-    scale = pixel_from_camera(other.camera, width, height)[:, 0]
+    scale, offset = pixel_from_camera(other.camera, width, height).T
+    slant, along = slope * scale, 1.0
     if isinstance(other.camera.projection, Perspective):
-        scale = scale / depth[:, None]  # pixels per scene unit at that depth
-    cosine = 1 / np.sqrt(1 + ((slope * scale) ** 2).sum(1))
+        slant = slant / depth[:, None]
+        along = 1 + (slant * (seen.pixel[which] - offset) / scale).sum(1)
+    cosine = 1 / np.sqrt(along**2 + (slant**2).sum(1))  # between the normal and the ray whose z is 1
     placed = depth + (depth - RIG_RADIUS) * warp.scale + warp.shift + seen.dz[which]
     residual = (seen.depth[which] - placed) * cosine
     near = (np.abs(residual) < gate) & (cosine > FACING)

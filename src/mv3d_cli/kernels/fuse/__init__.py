@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -72,7 +73,7 @@ def fuse(
     return distances.numpy()
 
 
-def _struct(picture: Picture, start: int) -> source.Picture:
+def _struct(picture: Picture, start: int) -> Any:
     """The view as the kernel reads it."""
     height, width = picture.texels.shape[:2]
     (sx, ox), (sy, oy) = pixel_from_camera(picture.camera, width, height)
