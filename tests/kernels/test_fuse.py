@@ -55,7 +55,7 @@ def sphere_from(camera: Camera, height: int = 160, width: int = 160, weight: flo
         depth = far - np.sqrt(RADIUS**2 - u**2 - v**2)
         place, ray = np.stack([u, v, depth - far]), np.stack([0 * u, 0 * u, np.ones_like(u)])
     facing = np.abs((place * ray).sum(0)) / RADIUS
-    texels = np.stack([depth, facing, np.hypot(x, y) - reach, 0 * depth], axis=-1)
+    texels = np.stack([depth, facing, np.hypot(x, y) - reach, 0 * depth + 1], axis=-1)
     return Picture(camera, texels.astype(np.float32), True, True, weight)
 
 
@@ -73,7 +73,9 @@ def noise(camera: Camera, height: int, width: int, rng: np.random.Generator, **k
     x, y = across(camera, height, width)
     depth = 2 + 0.1 * np.sin(5 * x) + np.where(rng.random((height, width)) < 0.1, 0.3, 0)
     outline = np.hypot(x, y) - 0.4 + rng.normal(0, 0.02, x.shape)
-    texels = np.stack([depth, rng.uniform(0.2, 1, x.shape), outline, 0 * x], axis=-1).astype(np.float32)
+    texels = np.stack([depth, rng.uniform(0.2, 1, x.shape), outline, rng.uniform(0, 1, x.shape)], axis=-1).astype(
+        np.float32
+    )
     if not known["outlined"]:
         texels[..., 2] = -1
     return Picture(camera, texels, **known, weight=rng.uniform(0.2, 2))
@@ -166,7 +168,7 @@ def test_nothing_lies_between_two_surfaces() -> None:
     """A wall at z = 2.4 behind a plate at 1.6: the space above the wall, beside the plate, is empty right up to it."""
     camera = Camera("down", np.diag([1.0, -1.0, -1.0, 1.0]) + np.pad([[2.0]], ((2, 1), (3, 0))), PARALLEL)
     x, _ = across(camera, 50, 50)
-    texels = np.stack([np.where(x < 0, 1.6, 2.4), np.ones_like(x), 0 * x - 1, 0 * x], axis=-1).astype(np.float32)
+    texels = np.stack([np.where(x < 0, 1.6, 2.4), np.ones_like(x), 0 * x - 1, 0 * x + 1], axis=-1).astype(np.float32)
     points, origin, voxel = grid(101)
     distance = fuse([Picture(camera, texels, True, False)], 101, origin, voxel, 0.05)
     apart = np.abs(points[..., 0]) > 1e-6  # right above the step, either may be meant
@@ -179,7 +181,7 @@ def test_weights_decide_between_views() -> None:
     pose = np.diag([1.0, -1.0, -1.0, 1.0])
     pose[2, 3] = 2.0
     camera = Camera("down", pose, PARALLEL)
-    low, high = (np.zeros((4, 4, 4), np.float32) + np.float32([depth, 1, -1, 0]) for depth in (2.0, 1.96))
+    low, high = (np.zeros((4, 4, 4), np.float32) + np.float32([depth, 1, -1, 1]) for depth in (2.0, 1.96))
     _, origin, voxel = grid(81)
 
     def level(first: float, second: float) -> float:

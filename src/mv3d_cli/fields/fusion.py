@@ -55,7 +55,7 @@ def _picture(relief: Relief) -> Picture:
     height, width = relief.shape
     texels = np.zeros((height, width, 4), dtype=np.float32)
     if relief.depth is not None and relief.slope is not None:
-        texels[..., 0], texels[..., 1] = relief.depth, _facing(relief)
+        texels[..., 0], texels[..., 1], texels[..., 3] = relief.depth, _facing(relief), relief.known
     if relief.outline is not None:
         texels[..., 2] = relief.outline * relief.pixel_width
     else:

@@ -21,6 +21,7 @@ from mv3d_cli.scene.views import View, Views
 
 EDGE = 2.0  # pixels' widths: neighbours further off the fitted plane hardly count
 SIGMA = 1.5  # pixels: how far measured or generated depth is smoothed; rendered depth is exact
+SLACK = 1.0  # pixels in 256: generated silhouettes err, and where many err the narrowest would carve
 STEP = 12.0  # pixels' widths of depth across three pixels: more is a step, not a slope
 
 Picture = Float32[np.ndarray, "height width"]
@@ -31,6 +32,7 @@ class Relief:
     """One view, ready to be looked up.
 
     depth    planar z, smooth; None: the view has no depth
+    known    pixels whose depth was known, not filled in
     slope    (h, w, 2) of depth; None without depth
     smooth   pixels whose depth is known and not beside a step
     outline  signed distance to the silhouette; None: the view does not say where the object ends
@@ -40,6 +42,7 @@ class Relief:
 
     camera: Camera
     depth: Picture | None
+    known: Bool[np.ndarray, "height width"]
     slope: Float32[np.ndarray, "height width 2"] | None
     smooth: Bool[np.ndarray, "height width"]
     outline: Picture | None
@@ -66,15 +69,18 @@ def relief_of(view: View) -> Relief:
     """One view as a relief; its depth is smoothed over planes unless it was rendered."""
     mask = mask_of(view)
     depth = slope = None
-    smooth = np.zeros(view.shape, dtype=bool)
+    smooth = valid = np.zeros(view.shape, dtype=bool)
     if view.depth is not None and known(view.depth).any():
         depth, slope, smooth = _surface(view)
+        valid = known(view.depth)
     color = None
     if view.color is not None:
         solid = cv2.erode(mask.astype(np.uint8), np.ones((3, 3))) > 0 if mask is not None else np.ones(view.shape, bool)
         color = _blurred_color(view.color[..., :3], solid if solid.any() else mask)
     outline = outline_of(view, mask) if mask is not None else None
-    return Relief(view.camera, depth, slope, smooth, outline, color, view.weight)
+    if outline is not None and view.source == "generated":
+        outline -= np.float32(SLACK * view.shape[1] / 256)
+    return Relief(view.camera, depth, valid, slope, smooth, outline, color, view.weight)
 
 
 def known(depth: Float[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:

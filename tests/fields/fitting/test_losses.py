@@ -26,6 +26,7 @@ def test_hull_error_holds_for_the_true_distances_of_a_sphere() -> None:
     shadow = points[:, :2].norm(dim=1) - 0.5
     assert float(losses.hull_error(points.norm(dim=1) - 0.5, shadow).max()) == 0
     fatter = losses.hull_error(points.norm(dim=1) - 0.7, shadow)
+    assert float(fatter[shadow <= 0].max()) == 0
     assert float(fatter.max()) > 0
     assert (fatter <= 0.2 + 1e-6).all()
 

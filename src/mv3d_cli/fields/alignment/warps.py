@@ -80,4 +80,5 @@ def warped(relief: Relief, warp: Warp) -> Relief:
     if relief.color is not None:
         color = moved(relief.color) / np.float32(warp.gain)
     smooth = moved(relief.smooth.astype(np.float32)) > 0.99
-    return replace(relief, depth=depth, slope=slope, smooth=smooth, outline=outline, color=color)
+    sure = moved(relief.known.astype(np.float32)) > 0.5
+    return replace(relief, depth=depth, known=sure, slope=slope, smooth=smooth, outline=outline, color=color)

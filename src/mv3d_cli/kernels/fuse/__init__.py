@@ -29,7 +29,7 @@ class Picture:
     """What one view brings.
 
     texels  depth (planar z), |normal . ray| with the ray's z being 1, outline (signed distance, negative inside;
-            scene units under parallel rays, scene units at distance 1 under a pinhole), unused
+            scene units under parallel rays, scene units at distance 1 under a pinhole), trust in depth, 0 to 1
     deep, outlined  whether depth and outline are known
     """
 

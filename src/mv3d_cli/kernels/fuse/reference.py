@@ -28,12 +28,12 @@ def fuse(
     outside = torch.full_like(points[:, 0], -reach)
     total, weights = torch.zeros_like(outside), torch.zeros_like(outside)
     for picture in pictures:
-        depth, facing, outline, cosine, z = _seen(points, picture)
+        depth, facing, outline, cosine, trust, z = _seen(points, picture)
         if picture.outlined:
             outside = torch.maximum(outside, outline)
         if picture.deep:
             distance = (depth - z) * facing
-            weight = picture.weight * cosine**2 * (1 + distance / reach).clamp(0, 1) * (outline < 0)
+            weight = trust * picture.weight * cosine**2 * (1 + distance / reach).clamp(0, 1) * (outline < 0)
             total += weight * distance.clamp(max=reach)
             weights += weight
     mean = torch.maximum(total / weights, outside)
@@ -42,7 +42,7 @@ def fuse(
 
 
 def _seen(points: Float[Tensor, "points 3"], picture: Picture) -> tuple[Tensor, ...]:
-    """Depth, |normal . ray| with the ray's z being 1, outline in scene units, cosine, and the points' own z."""
+    """Depth, |normal . ray| with the ray's z being 1, outline in scene units, cosine, trust, and the points' own z."""
     height, width = picture.texels.shape[:2]
     pose = torch.tensor(picture.camera.camera_from_world, device=points.device)
     (sx, ox), (sy, oy) = pixel_from_camera(picture.camera, width, height)
@@ -53,14 +53,14 @@ def _seen(points: Float[Tensor, "points 3"], picture: Picture) -> tuple[Tensor, 
         x, y = x / z, y / z
         length = (x**2 + y**2 + 1).sqrt()
     texels = torch.from_numpy(picture.texels).to(points)
-    depth, facing, outline, _ = _texels_at(texels, x * sx + ox, y * sy + oy).unbind(-1)
-    return depth, facing, outline * unit, facing / length, z
+    depth, facing, outline, trust = _texels_at(texels, x * sx + ox, y * sy + oy).unbind(-1)
+    return depth, facing, outline * unit, facing / length, trust, z
 
 
 def _texels_at(
     texels: Float[Tensor, "height width 4"], x: Float[Tensor, "points"], y: Float[Tensor, "points"]
 ) -> Float[Tensor, "points 4"]:
-    """Bilinear; beyond the border, the border; across a step in depth, the nearest texel's depth and cosine."""
+    """Bilinear; beyond the border, the border; across a step in depth, the nearest texel's depth, cosine and trust."""
     height, width = texels.shape[:2]
     column, row = (x - 0.5).clamp(0, width - 1.001), (y - 0.5).clamp(0, height - 1.001)
     j, i = column.long(), row.long()
@@ -70,5 +70,5 @@ def _texels_at(
     depths = torch.stack(corners)[..., 0]
     step = depths.amax(0) - depths.amin(0) > STEP
     near = texels[i + (down[:, 0] >= 0.5), j + (right[:, 0] >= 0.5)]
-    mixed[step, :2] = near[step, :2]
+    mixed[step] = torch.where(torch.arange(4) == 2, mixed[step], near[step])
     return mixed

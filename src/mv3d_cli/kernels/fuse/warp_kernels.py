@@ -10,7 +10,7 @@ STEP = wp.constant(0.06)
 
 @wp.struct
 class Picture:
-    """A view: camera, and where its texels (depth, |normal . ray|, outline in scene units, 0) lie on the shelf."""
+    """A view: camera, and where its texels (depth, |normal . ray|, outline in scene units, trust) lie on the shelf."""
 
     rotation: wp.mat33
     translation: wp.vec3
@@ -27,7 +27,7 @@ class Picture:
 
 @wp.func
 def texel_at(shelf: wp.array(dtype=wp.vec4), picture: Picture, x: wp.float32, y: wp.float32) -> wp.vec4:
-    """Bilinear; beyond the border, the border; across a step in depth, the nearest texel's depth."""
+    """Bilinear; beyond the border, the border; across a step in depth, the nearest texel but for its outline."""
     u = wp.clamp(x - 0.5, 0.0, wp.float32(picture.width) - 1.001)
     v = wp.clamp(y - 0.5, 0.0, wp.float32(picture.height) - 1.001)
     j = wp.int32(u)
@@ -44,7 +44,7 @@ def texel_at(shelf: wp.array(dtype=wp.vec4), picture: Picture, x: wp.float32, y:
     high = wp.max(wp.max(a[0], b[0]), wp.max(c[0], d[0]))
     if high - low > STEP:
         near = shelf[first + wp.int32(down + 0.5) * picture.width + wp.int32(right + 0.5)]
-        mixed = wp.vec4(near[0], near[1], mixed[2], mixed[3])
+        mixed = wp.vec4(near[0], near[1], mixed[2], near[3])
     return mixed
 
 
@@ -79,7 +79,7 @@ def distance_at(
             distance = (texel[0] - z) * texel[1]
             if distance > -reach:
                 cosine = texel[1] / length
-                weight = picture.weight * cosine * cosine * wp.min(1.0, 1.0 + distance / reach)
+                weight = texel[3] * picture.weight * cosine * cosine * wp.min(1.0, 1.0 + distance / reach)
                 total += weight * wp.min(distance, reach)
                 weights += weight
     if weights > 1.0e-6:

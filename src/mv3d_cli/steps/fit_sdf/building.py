@@ -99,12 +99,24 @@ def fitted(config: Config, views: Views, tell: Tell, work: Path) -> Fit:
     from mv3d_cli.fields.relief import mask_of, reliefs_of
 
     frame = unit_sphere_from_views([view.camera for view in views.frames], [mask_of(view) for view in views.frames])
-    reliefs = reliefs_of(framed(views, frame))
-    alignment = align(reliefs, [view.source == "photo" for view in views.frames])
+    alignment = align(reliefs_of(framed(views, frame)), [view.source == "photo" for view in views.frames])
+    if any(view.depth is None for view in views.frames):  # they stay where their cameras say
+        views = _with_depth(views, frame)
     fit = Fit(views, frame, alignment, config.resolution)
     if config.quick or not config.steps:
         return fit
     return _refined(config, fit, tell, work)
+
+
+def _with_depth(views: Views, frame: np.ndarray) -> Views:
+    """The views, those without depth given what their colours tell of it."""
+    from mv3d_cli.fields.stereo import with_depth_from_color
+    from mv3d_cli.scene.views import Views
+
+    seen = with_depth_from_color(framed(views, frame))
+    scale = np.float32(np.cbrt(np.linalg.det(frame[:3, :3])))
+    depths = [view.depth if view.depth is None else view.depth / scale for view in seen.frames]
+    return Views(tuple(replace(view, depth=depth) for view, depth in zip(views.frames, depths, strict=True)))
 
 
 def _refined(config: Config, fit: Fit, tell: Tell, work: Path) -> Fit:
