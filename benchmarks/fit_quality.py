@@ -49,7 +49,6 @@ def methods(condition: str, steps: int) -> dict[str, Callable]:
     }
     if not clean:
         found["aligned TSDF+"] = lambda views: tsdf_plus(aligned(views), tau=0.04)
-        found["aligned Poisson"] = lambda views: poisson(aligned(views))
     return found
 
 

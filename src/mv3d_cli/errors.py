@@ -8,6 +8,7 @@ Mv3dError                    the root; `str(error)` is the line, `error.hint` th
 |  |- BadImage               a picture that cannot be read
 |  |- BadCameras             a cameras file that cannot be read, or a view that is not in it
 |  |- BadViews               a views folder that cannot be read
+|  |- BadWeights             weights that are damaged, pickled, or of another model
 |  `- OutputRefused          an output path that we cannot, or must not, write to
 `- WorkFailed       exit 1   the input was fine and the work did not succeed
    |- OutOfSpace             the disk is full, or a size limit was met
@@ -60,6 +61,10 @@ class BadCameras(InputError):
 
 class BadViews(InputError):
     """A views folder that cannot be read."""
+
+
+class BadWeights(InputError):
+    """Weights that are damaged, pickled, or of another model."""
 
 
 class OutputRefused(InputError):

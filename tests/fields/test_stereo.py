@@ -8,6 +8,8 @@ import pytest
 import torch
 
 from mv3d_cli.fields import stereo
+from mv3d_cli.fields.fitting.samples import cameras_of
+from mv3d_cli.fields.relief import relief_of
 from mv3d_cli.fields.stereo import with_depth_from_color
 from mv3d_cli.scene.camera import Camera, Orthographic, Perspective, direction_on_sphere, look_at_origin
 from mv3d_cli.scene.views import Views
@@ -77,17 +79,12 @@ def test_the_least_cost_lies_between_labels() -> None:
     torch.testing.assert_close(found, true, atol=1e-4, rtol=0)
 
 
-def test_labels_reach_from_the_hull_to_behind_the_middle() -> None:
-    from mv3d_cli.fields.fitting.samples import cameras_of
-    from mv3d_cli.fields.relief import Relief
-
-    enters = torch.tensor([1.4, 1.9, 2.1])
-    for projection, even in ((Orthographic(), lambda z: z), (Perspective((1.0, 1.0)), lambda z: 1 / z)):
-        camera = look_at_origin("a", (0.0, -2.0, 0.0), projection)
-        nothing = np.zeros((4, 4), bool)
-        relief = Relief(camera=camera, depth=None, slope=None, smooth=nothing, outline=None, color=None, weight=1.0)
-        labels = stereo._labels(enters, cameras_of([relief]), 0)
-        assert labels.min() < 1.4
-        assert labels.max() > 2.6
-        gaps = even(labels).diff()
-        torch.testing.assert_close(gaps, gaps.mean().expand_as(gaps), atol=1e-5, rtol=0)
+@pytest.mark.parametrize("projection", [Orthographic(), Perspective((1.0, 1.0))], ids=["parallel", "pinhole"])
+def test_labels_reach_from_the_hull_to_behind_the_middle(ellipsoid, projection) -> None:
+    camera = look_at_origin("a", (0.0, -2.0, 0.0), projection)
+    cameras = cameras_of([relief_of(ellipsoid.view(camera, 16))])
+    labels = stereo._labels(torch.tensor([1.4, 1.9, 2.1]), cameras, 0)
+    assert labels.min() < 1.4
+    assert labels.max() > 2.6
+    gaps = (labels if isinstance(projection, Orthographic) else 1 / labels).diff()
+    torch.testing.assert_close(gaps, gaps.mean().expand_as(gaps), atol=1e-5, rtol=0)
