@@ -3,7 +3,7 @@
 tsdf             truncated signed distances (Curless & Levoy, 1996): nearest pixels, equal weights, binary visual hull
 tsdf_plus        the same with bilinear depth, weights of cos^2 and a hull with its edge inside the pixel
 poisson          screened Poisson (Kazhdan & Hoppe, 2013) of pymeshlab on the depth pixels and their normals
-poisson_trimmed  the same, cut off outside the silhouettes
+trimmed          what any of them made, cut off outside the silhouettes
 
 Parallel cameras, square pictures with colour and depth; signed distances are positive outside.
 """
@@ -93,9 +93,8 @@ def poisson(views: Views, depth: int = 8) -> Mesh:
     return _mesh(found.vertex_matrix(), found.face_matrix())
 
 
-def poisson_trimmed(views: Views, depth: int = 8) -> Mesh:
-    """Screened Poisson without the faces that leave a silhouette by more than TRIM_PIXELS; it is open there."""
-    mesh = poisson(views, depth)
+def trimmed(mesh: Mesh, views: Views) -> Mesh:
+    """A mesh of the views without the faces that leave a silhouette by more than TRIM_PIXELS; it is open there."""
     kept = np.ones(len(mesh.vertices), bool)
     for sight in _sights(views):
         move = sight.camera.camera_from_world

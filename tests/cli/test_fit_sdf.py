@@ -67,6 +67,15 @@ def test_pipes_and_is_kept(mv3d, made_views: Path) -> None:
     assert "render" in mv3d("cache", "why", first).stdout
 
 
+@pytest.mark.parametrize("suffix", ["obj", "stl"])
+def test_other_formats_come_with_all_their_files(mv3d, made_views: Path, tmp_path: Path, suffix: str) -> None:
+    made = mv3d("fit-sdf", made_views, "--quick", *SMALL, "-o", tmp_path / f"ball.{suffix}").path
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == ({"ball.obj", "ball.mtl", "ball.png"} if suffix == "obj" else {"ball.stl"})
+    mesh = trimesh.load(made, force="mesh")
+    assert mesh.extents == pytest.approx([2, 2, 2], abs=0.05)
+
+
 def test_weights_and_earlier_fits(mv3d, views: Path, tmp_path: Path, refused) -> None:
     some = mv3d("fit-sdf", views, "--quick", *SMALL, "--weight", "front=3,back=0").path
     kept = read_views(some / "views")

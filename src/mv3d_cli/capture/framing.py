@@ -34,7 +34,7 @@ def unit_sphere_from_views(
             "check transform_matrix: nerfstudio's cameras look along -z, with y up",
         )
     radius = max(_radius(camera, mask, centre) for camera, mask in seen)
-    if np.linalg.norm(centre) < ROOM and 0.4 < radius <= 1 + 1e-3 and np.linalg.norm(centre) + 0.9 * radius < 1.1:
+    if np.linalg.norm(centre) < ROOM and 0.4 < radius <= MARGIN and np.linalg.norm(centre) + 0.9 * radius < 1.1:
         return np.eye(4)
     scale = 1 / (MARGIN * radius)
     similarity = np.diag([scale, scale, scale, 1.0])

@@ -98,16 +98,22 @@ def mask_of(view: View) -> Bool[np.ndarray, "height width"] | None:
 
 
 def outline_of(view: View, mask: Bool[np.ndarray, "height width"]) -> Picture:
-    """Signed distance to the mask's edge, pixels; between pixels where the alpha is antialiased."""
+    """Signed distance to the mask's edge, pixels; between pixels where the alpha is antialiased.
+
+    Parallel cameras see the whole object, so nothing lies beyond their pictures; a pinhole's may cut it off.
+    """
+    rim = 0 if isinstance(view.camera.projection, Perspective) else 2
+    mask = np.pad(mask, rim)
     outer, inner = (np.asarray(distance_transform_edt(part)) for part in (~mask, mask))
     distance = outer - inner
     distance -= np.sign(distance) * 0.5  # the edge runs half-way between pixel centres
     if view.color is not None and ((view.color[..., 3] > 0) & (view.color[..., 3] < 255)).any():
-        covered = gaussian_filter(view.color[..., 3] / 255.0, 0.7)
+        covered = gaussian_filter(np.pad(view.color[..., 3], rim) / 255.0, 0.7)
         down, right = np.gradient(covered)
         finer = (0.5 - covered) / np.maximum(np.hypot(down, right), 0.15)
         distance = np.where(np.abs(distance) < 1, np.clip(finer, -1.5, 1.5), distance)
-    return distance.astype(np.float32)
+    height, width = view.shape
+    return distance[rim : rim + height, rim : rim + width].astype(np.float32)
 
 
 def nearest(valid: Bool[np.ndarray, "height width"]) -> tuple[np.ndarray, np.ndarray]:

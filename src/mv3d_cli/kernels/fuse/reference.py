@@ -53,7 +53,10 @@ def _seen(points: Float[Tensor, "points 3"], picture: Picture) -> tuple[Tensor, 
         x, y = x / z, y / z
         length = (x**2 + y**2 + 1).sqrt()
     texels = torch.from_numpy(picture.texels).to(points)
-    depth, facing, outline, trust = _texels_at(texels, x * sx + ox, y * sy + oy).unbind(-1)
+    column, row = x * sx + ox, y * sy + oy
+    depth, facing, outline, trust = _texels_at(texels, column, row).unbind(-1)
+    over = (column - column.clamp(0.5, width - 0.501), row - row.clamp(0.5, height - 0.501))
+    outline = outline + torch.hypot(*over) / sx
     return depth, facing, outline * unit, facing / length, trust, z
 
 

@@ -27,7 +27,7 @@ class Picture:
 
 @wp.func
 def texel_at(shelf: wp.array(dtype=wp.vec4), picture: Picture, x: wp.float32, y: wp.float32) -> wp.vec4:
-    """Bilinear; beyond the border, the border; across a step in depth, the nearest texel but for its outline."""
+    """Bilinear; across a step in depth the nearest texel but for its outline; outside grows beyond the border."""
     u = wp.clamp(x - 0.5, 0.0, wp.float32(picture.width) - 1.001)
     v = wp.clamp(y - 0.5, 0.0, wp.float32(picture.height) - 1.001)
     j = wp.int32(u)
@@ -45,7 +45,8 @@ def texel_at(shelf: wp.array(dtype=wp.vec4), picture: Picture, x: wp.float32, y:
     if high - low > STEP:
         near = shelf[first + wp.int32(down + 0.5) * picture.width + wp.int32(right + 0.5)]
         mixed = wp.vec4(near[0], near[1], mixed[2], near[3])
-    return mixed
+    beyond = wp.length(wp.vec2(x - 0.5 - u, y - 0.5 - v)) / picture.scale[0]
+    return wp.vec4(mixed[0], mixed[1], mixed[2] + beyond, mixed[3])
 
 
 @wp.func

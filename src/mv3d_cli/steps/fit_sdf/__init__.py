@@ -13,11 +13,14 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from mv3d_cli.errors import UsageError
+from mv3d_cli.steps import export
 from mv3d_cli.steps.settings import Between, Doc, Runtime, Tell, Warned, check, key_config, silent
 from mv3d_cli.store import Artifact, Recipe, produce
 
 VERSION = 1  # bumped when the same settings and inputs give other bytes
 MAIN = "mesh.glb"
+
+QUICK_TEXTURE = 512  # texels a side
 
 Device = Literal["cpu", "cuda"]
 
@@ -40,6 +43,17 @@ class Config:
     texture: Annotated[int, Doc("Texels a side; 0: colours at the vertices."), Between(0, 8192)] = 1024
     seed: Annotated[int, Doc("Seed of the refinement."), Between(0, 2**31)] = 0
     device: Annotated[Device, Doc("Where the refinement runs."), Runtime()] = "cpu"
+
+
+def texture_of(config: Config) -> int:
+    """Texels a side of the mesh's texture."""
+    return min(config.texture, QUICK_TEXTURE) if config.quick else config.texture
+
+
+def export_settings(config: Config) -> export.Config:
+    """What makes the fit's own mesh again, in another format."""
+    texture = texture_of(config)
+    return export.Config(faces=config.faces, texture=texture or QUICK_TEXTURE, vertex_colors=not texture)
 
 
 def run(config: Config, inputs: Sequence[Path], tell: Tell = silent) -> Artifact:

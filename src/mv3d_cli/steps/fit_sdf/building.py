@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mv3d_cli.errors import MissingInput, UsageError, WorkFailed
+from mv3d_cli.steps.fit_sdf import texture_of
 from mv3d_cli.steps.fit_sdf.checking import self_check, turntable, warnings_of
 from mv3d_cli.steps.sdf_fit import FIELD, VIEWS, Fit, MeshSettings, framed, fusion_of, mesh_of, residual_of, write_fit
 from mv3d_cli.steps.settings import Progress, Tell, Warned
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
 CHECKPOINT = "checkpoint.pt"
 EVERY = 2.0  # seconds between checkpoints
-QUICK_TEXTURE = 512
 
 
 def inputs_of(config: Config, folder: Path, tell: Tell) -> tuple[Views, dict[str, str]]:
@@ -80,8 +80,7 @@ def build(config: Config, views: Views, tell: Tell, work: Path) -> None:
 
     fit = fitted(config, views, tell, work)
     write_fit(work, fit)
-    texture = min(config.texture, QUICK_TEXTURE) if config.quick else config.texture
-    mesh = mesh_of(fit, MeshSettings(config.faces, texture))
+    mesh = mesh_of(fit, MeshSettings(config.faces, texture_of(config)))
     write_mesh(work / "mesh.glb", mesh)
     report = self_check(fit, mesh)
     (work / "check.json").write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
@@ -105,7 +104,7 @@ def fitted(config: Config, views: Views, tell: Tell, work: Path) -> Fit:
     fit = Fit(views, frame, alignment, config.resolution)
     if config.quick or not config.steps:
         return fit
-    return _refined(config, fit, tell, work)
+    return refined(config, fit, tell, work)
 
 
 def _with_depth(views: Views, frame: np.ndarray) -> Views:
@@ -119,7 +118,7 @@ def _with_depth(views: Views, frame: np.ndarray) -> Views:
     return Views(tuple(replace(view, depth=depth) for view, depth in zip(views.frames, depths, strict=True)))
 
 
-def _refined(config: Config, fit: Fit, tell: Tell, work: Path) -> Fit:
+def refined(config: Config, fit: Fit, tell: Tell, work: Path) -> Fit:
     """The fit with a trained residual; goes on from a checkpoint, and leaves them as it goes."""
     from mv3d_cli.fields import fitting, sdf
 
