@@ -39,7 +39,8 @@ test: lint  ## lint, then the whole test suite
 	$(BIN)/python -m pytest -n 2 -q
 
 bench: $(STAMP)  ## every figure of the README
-	@for script in benchmarks/render_*.py benchmarks/normals_*.py; do echo "## $$script"; $(BIN)/python $$script || exit 1; done
+	@for script in benchmarks/render_*.py benchmarks/normals_*.py benchmarks/hash_grid_*.py benchmarks/mesh_*.py \
+		benchmarks/fit_*.py; do echo "## $$script"; $(BIN)/python $$script || exit 1; done
 
 clean:  ## remove the environment and what was built
 	rm -rf .venv out build dist .pytest_cache .ruff_cache

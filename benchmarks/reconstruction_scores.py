@@ -13,7 +13,7 @@ from mv3d_cli.formats.images import read_image
 from mv3d_cli.formats.meshes import MeshFile, MeshWarning, read_mesh
 from mv3d_cli.kernels.rasterize import rasterize
 from mv3d_cli.metrics.shape import ShapeScores, Surface, outer_surface, shape_scores
-from mv3d_cli.scene.camera import Camera, pixel_from_camera
+from mv3d_cli.scene.camera import Camera, projected
 from mv3d_cli.scene.mesh import Mesh, transform
 from mv3d_cli.scene.views import View, Views
 from shared_data import scanned_mesh, shared
@@ -62,9 +62,7 @@ def _seen_by_rig(mesh: Mesh, points: np.ndarray) -> np.ndarray:
     cameras = rig()
     depths = rasterize(mesh.vertices, mesh.faces, cameras, VISIBILITY, VISIBILITY).depth
     for camera, depth in zip(cameras, depths, strict=True):
-        x, y, z = (points @ camera.camera_from_world[:3, :3].T + camera.camera_from_world[:3, 3]).T
-        (sx, ox), (sy, oy) = pixel_from_camera(camera, VISIBILITY, VISIBILITY)
-        column, row = sx * x + ox, sy * y + oy
+        (column, row), z = (part.T for part in projected(camera, points, VISIBILITY, VISIBILITY))
         place = tuple(np.clip(np.floor(v).astype(int), 0, VISIBILITY - 1) for v in (row, column))
         seen |= z < depth[place] + STEP
     return seen

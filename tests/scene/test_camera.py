@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mv3d_cli.scene.camera import Orthographic, Perspective, direction_on_sphere, look_at_origin, pixel_from_camera
+from mv3d_cli.scene.camera import (
+    Orthographic,
+    Perspective,
+    direction_on_sphere,
+    look_at_origin,
+    pixel_from_camera,
+    projected,
+)
 
 FRONT = look_at_origin("front", (0.0, -2.0, 0.0), Orthographic())
 
@@ -41,3 +48,15 @@ def test_directions_turn_counter_clockwise_from_the_front() -> None:
     assert np.allclose(direction_on_sphere(0.0, 0.0), (0, -2, 0))
     assert np.allclose(direction_on_sphere(np.pi / 2, 0.0), (2, 0, 0))
     assert np.allclose(direction_on_sphere(0.0, np.pi / 2, 1.0), (0, 0, 1))
+
+
+@pytest.mark.parametrize("projection", [Orthographic(0.8), Perspective((1.1, 1.4), (0.45, 0.6))])
+def test_projected_points_lie_on_their_pixels_rays(projection: Orthographic | Perspective) -> None:
+    camera = look_at_origin("slanted", (1.0, -1.5, 0.7), projection)
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
+    (x, y), z = (part.T for part in projected(camera, points, 40, 30))
+    (sx, ox), (sy, oy) = pixel_from_camera(camera, 40, 30)
+    ray = np.stack([(x - ox) / sx, (y - oy) / sy, np.ones_like(x)], axis=1)
+    place = ray * z[:, None] if isinstance(projection, Perspective) else np.column_stack([ray[:, :2], z])
+    world = place @ camera.world_from_camera[:3, :3].T + camera.world_from_camera[:3, 3]
+    assert world == pytest.approx(points, abs=1e-12)

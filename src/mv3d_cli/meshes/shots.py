@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from mv3d_cli.kernels.rasterize import rasterize
 from mv3d_cli.kernels.runtime import in_threads
-from mv3d_cli.scene.camera import Camera, Orthographic, pixel_from_camera
+from mv3d_cli.scene.camera import Camera, Orthographic, pixel_from_camera, projected
 from mv3d_cli.scene.mesh import Mesh
 
 PixelOf = Callable[[Float[np.ndarray, "points 3"]], Float[np.ndarray, "points 2"]]
@@ -91,7 +91,7 @@ def witness(sight: Sight, points: Float32[np.ndarray, "points 3"], normals: Floa
     front = front[_visible(sight, points[front], facing[front])]
     if not len(front):
         return Witness(trust, color)
-    plain = _plain(sight, points[front])
+    plain, _ = _placed(sight, points[front])
     place = sight.shot.pixel_of(points[front]) if sight.shot.pixel_of is not None else plain
     near = _lookup(sight.feather, FINER * plain, cv2.INTER_LINEAR)
     sampled = _lookup(sight.picture, place, cv2.INTER_CUBIC)
@@ -147,9 +147,9 @@ def _facing(camera: Camera, points: np.ndarray, normals: np.ndarray) -> Float32[
 
 def _visible(sight: Sight, points: np.ndarray, facing: np.ndarray) -> np.ndarray:
     """Whether nothing of the mesh is before the points, within what the slope explains."""
-    place = (FINER * _plain(sight, points)).astype(np.int32)
+    pixels, z = _placed(sight, points)
+    place = (FINER * pixels).astype(np.int32)
     height, width = sight.depth.shape
-    z = _in_camera(sight.shot.camera, points)[:, 2]
     within = (place >= 0).all(axis=1) & (place < [width, height]).all(axis=1) & (z > 0)
     column, row = place.clip(0, [width - 1, height - 1]).T
     slope = np.minimum(np.sqrt(1 - np.minimum(facing, 1) ** 2) / facing, 6)
@@ -157,20 +157,10 @@ def _visible(sight: Sight, points: np.ndarray, facing: np.ndarray) -> np.ndarray
     return within & (z <= sight.depth[row, column] + bias)
 
 
-def _in_camera(camera: Camera, points: np.ndarray) -> Float32[np.ndarray, "points 3"]:
-    matrix = camera.camera_from_world.astype(np.float32)
-    return points @ matrix[:3, :3].T + matrix[:3, 3]
-
-
-def _plain(sight: Sight, points: np.ndarray) -> Float32[np.ndarray, "points 2"]:
-    """The points in the picture by the camera alone."""
-    camera, (height, width) = sight.shot.camera, sight.shot.color.shape[:2]
-    scale, offset = pixel_from_camera(camera, width, height).astype(np.float32).T
-    place = _in_camera(camera, points)
-    flat = (
-        place[:, :2] if isinstance(camera.projection, Orthographic) else place[:, :2] / np.maximum(place[:, 2:], 1e-6)
-    )
-    return scale * flat + offset
+def _placed(sight: Sight, points: np.ndarray) -> tuple[Float32[np.ndarray, "points 2"], Float32[np.ndarray, "points"]]:
+    """The points in the picture by the camera alone, and their planar z."""
+    height, width = sight.shot.color.shape[:2]
+    return projected(sight.shot.camera, points, width, height)
 
 
 def _lookup(picture: np.ndarray, place: Float[np.ndarray, "points 2"], how: int) -> np.ndarray:

@@ -52,6 +52,19 @@ def pixel_from_camera(camera: Camera, width: int, height: int) -> Float[np.ndarr
             return np.array([[fx * width, cx * width], [fy * height, cy * height]])
 
 
+def projected(
+    camera: Camera, points: Float[np.ndarray, "points 3"], width: int, height: int
+) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, "points"]]:
+    """Where a picture of `width` by `height` pixels shows points of the world: (x, y) in pixels, and planar z."""
+    camera_from_world = camera.camera_from_world.astype(points.dtype)
+    place = points @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+    across, z = place[:, :2], place[:, 2]
+    if isinstance(camera.projection, Perspective):
+        across = across / np.maximum(z, 1e-6)[:, None]
+    scale, offset = pixel_from_camera(camera, width, height).astype(points.dtype).T
+    return scale * across + offset, z
+
+
 def look_at_origin(name: str, position: tuple[float, float, float], projection: Orthographic | Perspective) -> Camera:
     """A camera at `position` (scene units) that looks at the origin with +Z up in the picture.
 

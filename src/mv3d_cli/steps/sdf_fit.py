@@ -177,13 +177,10 @@ def shots_of(fit: Fit) -> list[Shot]:
 def _pixel_of(view: View, warp: Warp, points: np.ndarray) -> np.ndarray:
     """Where the aligned view shows points of the world, (x, y) in its picture as it came."""
     from mv3d_cli.fields.alignment.warps import came_from
-    from mv3d_cli.scene.camera import Perspective, pixel_from_camera
+    from mv3d_cli.scene.camera import projected
 
-    pose = view.camera.camera_from_world
-    place = points @ pose[:3, :3].T + pose[:3, 3]
-    (sx, ox), (sy, oy) = pixel_from_camera(view.camera, view.shape[1], view.shape[0])
-    across = place[:, :2] / place[:, 2:] if isinstance(view.camera.projection, Perspective) else place[:, :2]
-    return came_from(warp, across * (sx, sy) + (ox, oy), view.shape)
+    height, width = view.shape
+    return came_from(warp, projected(view.camera, points, width, height)[0], view.shape)
 
 
 def _colored(bare: Mesh, shots: list[Shot], settings: MeshSettings) -> Mesh:

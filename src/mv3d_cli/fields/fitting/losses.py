@@ -1,7 +1,7 @@
 """What a fitted surface is held to: one function for each loss, then how losses become one number.
 
 A loss is an error for each sample, zero at best and unweighted; distances in scene units, colours sRGB in [0, 1].
-`total` weighs samples, drops the worst of them and balances the losses. The sum is the report's equation 7.
+`total` weighs samples, drops the worst of them and balances the losses.
 """
 
 from __future__ import annotations
