@@ -21,6 +21,7 @@ VERSION = 1  # bumped when the same settings and inputs give other bytes
 MAIN = "mesh.glb"
 
 QUICK_TEXTURE = 512  # texels a side
+QUICK_RESOLUTION = 160  # voxels a side
 
 Device = Literal["cpu", "cuda"]
 
@@ -32,7 +33,7 @@ class Config:
     steps: Annotated[
         int, Doc("Training steps of the refinement; 0: the closed-form fusion alone."), Between(0, 100_000)
     ] = 200
-    quick: Annotated[bool, Doc("A faster, rougher result: no refinement, a smaller texture.")] = False
+    quick: Annotated[bool, Doc("A faster, rougher result: no refinement, fewer voxels, a smaller texture.")] = False
     max_time: Annotated[float | None, Doc("Refine for at most this many seconds."), Between(0, 1e6)] = None
     resolution: Annotated[int, Doc("Voxels a side of the fusion."), Between(32, 512)] = 192
     weight: Annotated[tuple[str, ...], Doc("Trust in views, such as front=3,back=0.5; 0 leaves a view out.")] = ()
@@ -48,6 +49,11 @@ class Config:
 def texture_of(config: Config) -> int:
     """Texels a side of the mesh's texture."""
     return min(config.texture, QUICK_TEXTURE) if config.quick else config.texture
+
+
+def resolution_of(config: Config) -> int:
+    """Voxels a side of the fusion."""
+    return min(config.resolution, QUICK_RESOLUTION) if config.quick else config.resolution
 
 
 def export_settings(config: Config) -> export.Config:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mv3d_cli.errors import MissingInput, UsageError, WorkFailed
-from mv3d_cli.steps.fit_sdf import texture_of
+from mv3d_cli.steps.fit_sdf import resolution_of, texture_of
 from mv3d_cli.steps.fit_sdf.checking import self_check, turntable, warnings_of
 from mv3d_cli.steps.sdf_fit import FIELD, VIEWS, Fit, MeshSettings, framed, fusion_of, mesh_of, residual_of, write_fit
 from mv3d_cli.steps.settings import Progress, Tell, Warned
@@ -101,7 +101,7 @@ def fitted(config: Config, views: Views, tell: Tell, work: Path) -> Fit:
     alignment = align(reliefs_of(framed(views, frame)), [view.source == "photo" for view in views.frames])
     if any(view.depth is None for view in views.frames):  # they stay where their cameras say
         views = _with_depth(views, frame)
-    fit = Fit(views, frame, alignment, config.resolution)
+    fit = Fit(views, frame, alignment, resolution_of(config))
     if config.quick or not config.steps:
         return fit
     return refined(config, fit, tell, work)
