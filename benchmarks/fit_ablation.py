@@ -69,7 +69,7 @@ def outcome(variant: Variant, views: Any, truth: Any) -> tuple[float, float, flo
     with ExitStack() as changes:
         for (module, name), value in variant.constants.items():
             changes.enter_context(patch(f"{module}.{name}", value))
-        kept = {name: share for name, share in fitting.SHARES.items() if name not in variant.without}
+        kept = {name: 0.0 if name in variant.without else share for name, share in fitting.SHARES.items()}
         changes.enter_context(patch.object(fitting, "SHARES", kept))
         started = time.perf_counter()
         fit, aligned, start = _start(variant, views)
