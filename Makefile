@@ -25,9 +25,10 @@ blender: $(STAMP)  ## add Blender, for --engine blender and its tests (Python 3.
 ray: $(STAMP)  ## add Ray, for --workers ray and its tests
 	$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[ray]'
 
-demo: $(STAMP)  ## draw 16 objects of our own and print where they are
-	$(BIN)/mv3d render --procedural 16 --size 256 --lighting studio -o out/demo
-	@echo "look at out/demo/sheet.png"
+demo: $(STAMP)  ## make a mesh of a coffee cup from one photo, and print where it is
+	$(BIN)/mv3d generate $$($(BIN)/python -c 'from skimage import data; print(data.__path__[0])')/coffee.png -o out/demo/views
+	$(BIN)/mv3d fit-sdf out/demo/views -o out/demo/cup.glb
+	@echo "look at out/demo/views/sheet.png, and open out/demo/cup.glb in any 3D viewer"
 
 lint: $(STAMP)  ## style, types and the import rule
 	$(BIN)/ruff check .
@@ -40,7 +41,7 @@ test: lint  ## lint, then the whole test suite
 
 bench: $(STAMP)  ## every figure of the README
 	@for script in benchmarks/render_*.py benchmarks/normals_*.py benchmarks/hash_grid_*.py benchmarks/mesh_*.py \
-		benchmarks/fit_*.py; do echo "## $$script"; $(BIN)/python $$script || exit 1; done
+		benchmarks/fit_*.py benchmarks/train_*.py benchmarks/diffusion_*.py benchmarks/generate_*.py benchmarks/nvs.py; do echo "## $$script"; $(BIN)/python $$script || exit 1; done
 
 clean:  ## remove the environment and what was built
 	rm -rf .venv out build dist .pytest_cache .ruff_cache

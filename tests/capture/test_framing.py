@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from mv3d_cli.capture.framing import moved_camera, unit_sphere_from_views
+from mv3d_cli.capture.framing import moved_camera, random_turn, unit_sphere_from_views
 from mv3d_cli.errors import BadViews
 from mv3d_cli.formats.cameras import load_cameras
 from mv3d_cli.scene.camera import (
@@ -121,3 +121,22 @@ def test_a_moved_camera_sees_the_same_pixels(kind: str, turn: tuple, scale: floa
         assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
         back = moved_camera(moved, np.linalg.inv(b_from_a))
         assert np.allclose(back.world_from_camera, camera.world_from_camera, atol=1e-6)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0, 180))
+def test_a_random_turn_is_a_rotation_that_tips_no_further_than_told(seed, tilt):
+    turned = random_turn(np.random.default_rng(seed), tilt)
+    rotation = turned[:3, :3]
+    assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    assert np.array_equal(turned[3], [0, 0, 0, 1])
+    assert not turned[:3, 3].any()
+    assert np.degrees(np.arccos(np.clip(rotation[2, 2], -1, 1))) <= tilt + 1e-5
+
+
+def test_random_turns_cover_the_circle():
+    headings = [
+        np.arctan2(*random_turn(np.random.default_rng(seed), 0.0)[:2, 0][::-1]) for seed in range(400)
+    ]  # where the x axis goes
+    counts, _ = np.histogram(headings, bins=8, range=(-np.pi, np.pi))
+    assert counts.min() > 25

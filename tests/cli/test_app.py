@@ -9,12 +9,12 @@ import subprocess
 import sys
 import time
 from dataclasses import fields
-from typing import get_args
+from typing import Literal, get_args, get_origin
 
 import pytest
 
 from mv3d_cli import __version__
-from mv3d_cli.steps.render import Config
+from mv3d_cli.steps import generate, render, train
 from mv3d_cli.steps.settings import Doc, settings_of
 
 WIDE = {"COLUMNS": "300", "TERMINAL_WIDTH": "300"}
@@ -35,7 +35,7 @@ def test_help_answers_at_once(mv3d):
     assert min(times) < 0.3
 
 
-@pytest.mark.parametrize("words", [["--help"], ["render", "--help"]])
+@pytest.mark.parametrize("words", [["--help"], ["render", "--help"], ["train", "--help"], ["generate", "--help"]])
 def test_help_imports_no_numbers(words):
     code = f"""
 import json, sys
@@ -53,8 +53,7 @@ print(json.dumps(sorted(heavy & set(sys.modules))), file=sys.stderr)
 def test_help_lists_the_commands(mv3d):
     ran = mv3d("--help")
     assert (ran.code, ran.stderr) == (0, "")
-    assert "render" in ran.stdout
-    assert "cache" in ran.stdout
+    assert all(command in ran.stdout for command in ("render", "train", "generate", "cache"))
 
 
 def test_without_arguments_it_helps(mv3d):
@@ -123,6 +122,8 @@ def test_completion_script(mv3d):
     ("line", "offered"),
     [
         ("mv3d ren", ["render"]),
+        ("mv3d train --pres", ["--preset"]),
+        ("mv3d train --stage a", ["autoencoder"]),
         ("mv3d render --lig", ["--lighting"]),
         ("mv3d render --lighting st", ["studio"]),
         ("mv3d cache ver", ["verify"]),
@@ -157,18 +158,22 @@ app.main()
     assert "ZeroDivisionError: oh no" in done.stderr
 
 
-def test_the_options_of_render_are_its_settings(mv3d):
-    page = mv3d("render", "--help", env=WIDE).stdout
+@pytest.mark.parametrize(
+    ("command", "config"), [("render", render.Config), ("train", train.Config), ("generate", generate.Config)]
+)
+def test_the_options_of_a_command_are_its_settings(mv3d, command, config):
+    page = mv3d(command, "--help", env=WIDE).stdout
     options = re.findall(r"^\W*(--[a-z-]+)", page, re.MULTILINE)
-    assert options == ["--output", "--json", *(s.option for s in settings_of(Config)), "--help"]
-    for setting in settings_of(Config):
+    assert options == ["--output", "--json", *(s.option for s in settings_of(config)), "--help"]
+    for setting in settings_of(config):
         (line,) = (line for line in page.splitlines() if f" {setting.option} " in line)
         assert setting.mark(Doc).text in line
-        if setting.default not in (None, ()):
-            assert f"[default: {setting.default}]" in line
-        for choice in get_args(setting.kind) if setting.name in ("lighting", "engine", "up", "device") else ():
+        default = ",".join(setting.default) if isinstance(setting.default, tuple) else setting.default
+        if default not in (None, "") and default is not False:
+            assert f"[default: {default}]" in line
+        for choice in get_args(setting.kind) if get_origin(setting.kind) is Literal else ():
             assert choice in line
-    assert len(fields(Config)) == len(settings_of(Config))
+    assert len(fields(config)) == len(settings_of(config))
 
 
 def test_a_reader_that_leaves_is_no_error(tmp_path):

@@ -7,6 +7,8 @@ from typing import Any
 import pytest
 import torch
 
+from mv3d_cli.diffusion.model import Model
+from mv3d_cli.diffusion.model.config import ModelConfig
 from mv3d_cli.diffusion.network import MultiViewUNet
 from mv3d_cli.diffusion.network.conditioning import Condition
 from mv3d_cli.formats.cameras import load_cameras
@@ -34,6 +36,12 @@ def unet_config() -> dict[str, Any]:
 def network(unet_config: dict[str, Any]) -> MultiViewUNet:
     torch.manual_seed(0)
     return MultiViewUNet(unet_config, positions=False).eval()
+
+
+@pytest.fixture
+def model(smallest: ModelConfig) -> Model:
+    torch.manual_seed(0)
+    return Model(smallest).eval()
 
 
 @pytest.fixture

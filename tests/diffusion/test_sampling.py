@@ -8,12 +8,18 @@ import torch
 from diffusers import DDIMScheduler, DPMSolverMultistepScheduler, LCMScheduler
 from torch import Tensor
 
-from mv3d_cli.diffusion.noise import NoiseSettings, Schedule, prediction_from_clean, schedule_from_settings
-from mv3d_cli.diffusion.sampling import Step, ddim, dpm_solver, initial_noise, lcm, trailing_timesteps
+from mv3d_cli.diffusion.noise import (
+    NoiseSettings,
+    Schedule,
+    clean_from_prediction,
+    prediction_from_clean,
+    schedule_from_settings,
+)
+from mv3d_cli.diffusion.sampling import Step, consistency, ddim, dpm_solver, initial_noise, lcm, trailing_timesteps
 from mv3d_cli.errors import UsageError
 
 SHAPE = (2, 2, 3, 4, 5, 5)
-PREDICTIONS = ["epsilon", "v_prediction"]
+PREDICTIONS = ["epsilon", "v_prediction", "sample"]
 
 
 def schedule(prediction: str = "v_prediction", zero_terminal: bool = False) -> Schedule:
@@ -55,7 +61,8 @@ def theirs(scheduler, latents: Tensor, generator: torch.Generator | None = None)
 
 @pytest.mark.parametrize("steps", [1, 2, 4, 5, 10, 50])
 @pytest.mark.parametrize(
-    ("prediction", "zero_terminal"), [("epsilon", False), ("v_prediction", False), ("v_prediction", True)]
+    ("prediction", "zero_terminal"),
+    [(name, False) for name in PREDICTIONS] + [("v_prediction", True), ("sample", True)],
 )
 def test_ddim_equals_diffusers(prediction: str, zero_terminal: bool, steps: int) -> None:
     scheduler = DDIMScheduler(
@@ -129,3 +136,27 @@ def test_a_seed_is_the_same_noise_in_any_precision() -> None:
     torch.testing.assert_close(one, same, atol=0, rtol=0)
     assert (one - other).abs().mean() > 0.5
     torch.testing.assert_close(initial_noise(SHAPE, 3, torch.zeros(1, dtype=torch.bfloat16)), one.bfloat16())
+
+
+@pytest.mark.parametrize("prediction", PREDICTIONS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_each_object_has_a_consistency_of_its_own(prediction: str, dtype: torch.dtype) -> None:
+    """With a timestep an object it is what it is for each alone; at 0 it is the identity, late the clean latents."""
+    ours, timestep = schedule(prediction), torch.tensor([0, 1, 19, 500, 999])
+    noisy, answers = (torch.randn(5, *SHAPE[1:], dtype=dtype) for _ in range(2))
+    together = consistency(ours, answers, noisy, timestep)
+    alone = [consistency(ours, answers[i : i + 1], noisy[i : i + 1], int(t)) for i, t in enumerate(timestep)]
+    torch.testing.assert_close(together, torch.cat(alone), atol=0, rtol=0)
+    torch.testing.assert_close(together[0], noisy[0], atol=0, rtol=0)
+    clean = clean_from_prediction(ours, answers, noisy, timestep)
+    torch.testing.assert_close(together[3:], clean[3:], atol=1e-4, rtol=1e-4)
+    assert together.dtype == dtype
+
+
+def test_consistency_weights_are_those_of_the_papers_scheduler() -> None:
+    ours, scheduler = schedule(), LCMScheduler(**diffusers_settings("v_prediction"))
+    noisy, answers = torch.randn(2, 3), torch.randn(2, 3)
+    clean = clean_from_prediction(ours, answers, noisy, torch.tensor([1, 7]))
+    weights = [scheduler.get_scalings_for_boundary_condition_discrete(t) for t in (1, 7)]
+    expected = [keep * noisy[i] + give * clean[i] for i, (keep, give) in enumerate(weights)]
+    torch.testing.assert_close(consistency(ours, answers, noisy, torch.tensor([1, 7])), torch.stack(expected))

@@ -11,14 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
-from hypothesis import strategies as st
 
 from mv3d_cli.errors import UsageError
 from mv3d_cli.formats.meshes import read_mesh
 from mv3d_cli.formats.views_folder import read_views
 from mv3d_cli.steps.render import Config, run
-from mv3d_cli.steps.render.objects import random_turn, work_of
+from mv3d_cli.steps.render.objects import work_of
 from mv3d_cli.steps.settings import Runtime, Warned, settings_of
 
 TINY = Config(size=16, lighting="none", views=("front",))
@@ -116,25 +114,6 @@ def test_procedural_objects_come_from_the_seed():
     assert not {item.digest for item in first} & {item.digest for item in other}
     with pytest.raises(UsageError):
         work_of(Config(), [])
-
-
-@given(st.integers(0, 2**32 - 1), st.floats(0, 180))
-def test_a_random_turn_is_a_rotation_that_tips_no_further_than_told(seed, tilt):
-    turned = random_turn(np.random.default_rng(seed), tilt)
-    rotation = turned[:3, :3]
-    assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(rotation) == pytest.approx(1)
-    assert np.array_equal(turned[3], [0, 0, 0, 1])
-    assert not turned[:3, 3].any()
-    assert np.degrees(np.arccos(np.clip(rotation[2, 2], -1, 1))) <= tilt + 1e-5
-
-
-def test_random_turns_cover_the_circle():
-    headings = [
-        np.arctan2(*random_turn(np.random.default_rng(seed), 0)[:2, 0][::-1]) for seed in range(400)
-    ]  # where the x axis goes
-    counts, _ = np.histogram(headings, bins=8, range=(-np.pi, np.pi))
-    assert counts.min() > 25
 
 
 @pytest.mark.parametrize("rotations", [0, 2])

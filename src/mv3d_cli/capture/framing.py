@@ -1,4 +1,4 @@
-"""Other people's scenes brought into the unit sphere: what the silhouettes say of the object's place and size."""
+"""Objects brought into the unit sphere: meshes, at random turns, and other people's scenes by their silhouettes."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mv3d_cli.errors import BadViews
+from mv3d_cli.errors import BadMesh, BadViews
 from mv3d_cli.scene.camera import Camera, Orthographic, Perspective, pixel_from_camera
+from mv3d_cli.scene.mesh import Mesh, transform, unit_sphere_from_mesh
 
 MARGIN = 1.02  # of the sphere that the outlines span
 ROOM = 0.35  # scene units: a centre within, and a radius up to 1, is where our own views have the object
@@ -40,6 +41,26 @@ def unit_sphere_from_views(
     similarity = np.diag([scale, scale, scale, 1.0])
     similarity[:3, 3] = -scale * centre
     return similarity
+
+
+def placed(mesh: Mesh, turned: Float[np.ndarray, "4 4"]) -> tuple[Mesh, Float[np.ndarray, "4 4"]]:
+    """The mesh turned and brought into the unit sphere, and the similarity that did it. Raises BadMesh."""
+    moved = transform(mesh, turned)
+    similarity = unit_sphere_from_mesh(moved)
+    if not np.isfinite(similarity).all():
+        raise BadMesh("the mesh has no extent", "all of its vertices lie in one place; check the file")
+    return transform(moved, similarity), similarity @ turned
+
+
+def random_turn(rng: np.random.Generator, tilt: float) -> Float[np.ndarray, "4 4"]:
+    """A turn about +Z, even over the circle, then a tip of up to `tilt` degrees about a random horizontal axis."""
+    from scipy.spatial.transform import Rotation
+
+    axis = rng.uniform(0, 2 * np.pi)
+    tip = Rotation.from_rotvec(np.deg2rad(rng.uniform(0, tilt)) * np.array([np.cos(axis), np.sin(axis), 0.0]))
+    turned = np.eye(4)
+    turned[:3, :3] = (tip * Rotation.from_euler("z", rng.uniform(0, 2 * np.pi))).as_matrix()
+    return turned
 
 
 def moved_camera(camera: Camera, b_from_a: Float[np.ndarray, "4 4"]) -> Camera:

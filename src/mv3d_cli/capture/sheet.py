@@ -100,3 +100,14 @@ def sheet_of_objects(pictures: Sequence[UInt8[np.ndarray, "_h _w 4"]]) -> Pictur
     side = max(int(np.ceil(np.sqrt(len(pictures)))), 1)
     cells = [_framed(color_cell(picture)) for picture in pictures]
     return _page([cells[i : i + side] for i in range(0, len(cells), side)])
+
+
+def sheet_of_rows(rows: Sequence[Sequence[np.ndarray | None]], near: float = 1.0, far: float = 3.0) -> Picture:
+    """Rows of colours (RGBA) and depths (one channel) of any sizes; None leaves a cell empty."""
+
+    def cell(picture: np.ndarray | None) -> Picture:
+        if picture is None:
+            return np.full((CELL, CELL, 3), 255, np.uint8)
+        return _framed(color_cell(picture) if picture.ndim == 3 else depth_cell(picture, near, far))
+
+    return _page([[cell(picture) for picture in row] for row in rows])

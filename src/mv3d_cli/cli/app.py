@@ -20,6 +20,8 @@ from mv3d_cli.errors import Mv3dError, UsageError, WorkFailed
 
 COMMANDS = {
     "render": "Meshes become views: colour, depth and normals from a rig of cameras.",
+    "train": "Objects become a model: photo -> views, colour and depth, by multi-view diffusion.",
+    "generate": "One photo becomes views: eight sides of the object, colour and depth.",
     "depth2normal": "Depth becomes normals: metric, filtered, sharp at silhouettes and steps.",
     "fit-sdf": "Views become a textured mesh: aligned, fused, refined by a neural signed distance field.",
     "export": "Meshes and fits into glb, obj, ply or stl: simplified, coloured, to a height in millimetres.",

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from mv3d_cli.errors import UsageError
 
-Prediction = Literal["epsilon", "v_prediction"]
+Prediction = Literal["epsilon", "v_prediction", "sample"]
+"""What a network answers with: the noise, v, or the clean latents; the names are diffusers'."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,10 @@ def noisy_from_clean(
 def prediction_from_clean(
     schedule: Schedule, clean: Tensor, noise: Tensor, timestep: Int[Tensor, " objects"] | int
 ) -> Tensor:
-    """What the network should answer: the noise, or v = alpha * noise - sigma * clean (Salimans and Ho 2022)."""
+    """What the network should answer: the noise, v = alpha * noise - sigma * clean (Salimans and Ho 2022), or what is
+    clean."""
+    if schedule.prediction == "sample":
+        return clean
     if schedule.prediction == "epsilon":
         return noise
     alpha, sigma = coefficients(schedule, timestep, clean)
@@ -103,6 +107,8 @@ def clean_from_prediction(
     schedule: Schedule, prediction: Tensor, noisy: Tensor, timestep: Int[Tensor, " objects"] | int
 ) -> Tensor:
     """The clean latents that the network's answer implies: the inverse of `prediction_from_clean`."""
+    if schedule.prediction == "sample":
+        return prediction
     alpha, sigma = coefficients(schedule, timestep, noisy)
     if schedule.prediction == "epsilon":
         return (noisy - sigma * prediction) / alpha
@@ -116,19 +122,24 @@ def noise_from_prediction(
     if schedule.prediction == "epsilon":
         return prediction
     alpha, sigma = coefficients(schedule, timestep, noisy)
+    if schedule.prediction == "sample":
+        return (noisy - alpha * prediction) / sigma
     return alpha * prediction + sigma * noisy
 
 
 def min_snr_weight(
-    schedule: Schedule, timestep: Int[Tensor, " objects"], gamma: float = 5.0
+    schedule: Schedule, timestep: Int[Tensor, " objects"], gamma: float = 5.0, floor: float = 0.0
 ) -> Float[Tensor, " objects"]:
-    """The weight of each object's squared error: min(SNR, gamma) on clean latents (Hang et al. 2023), as seen by the
-    prediction in use."""
+    """The weight of each object's squared error, as seen by the prediction in use: on clean latents it is the SNR, at
+    most `gamma` (Hang et al. 2023) and at least `floor` (Salimans and Ho 2022: 1). Without a floor nothing is learnt
+    from pure noise; where noise is predicted there is none."""
     index = timestep.cpu()
     signal, noise = schedule.alpha[index] ** 2, schedule.sigma[index] ** 2
     # |noise error|^2 = SNR |clean error|^2 and |v error|^2 = |clean error|^2 / sigma^2 with sigma^2 = 1 / (SNR + 1)
-    if schedule.prediction == "epsilon":
+    if schedule.prediction == "sample":
+        weight = (signal / noise).clamp(floor, gamma)
+    elif schedule.prediction == "epsilon":
         weight = (gamma * noise / signal).clamp_max(1)
     else:
-        weight = torch.minimum(signal, gamma * noise)
+        weight = torch.maximum(torch.minimum(signal, gamma * noise), floor * noise)
     return weight.float().to(timestep.device)

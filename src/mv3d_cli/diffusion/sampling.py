@@ -12,12 +12,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
 from mv3d_cli.diffusion.noise import Schedule, clean_from_prediction, noise_from_prediction
 from mv3d_cli.errors import UsageError
 
 Predict = Callable[[Tensor, int], Tensor]
+_DATA_DEVIATION = 0.5  # as consistency models have it
 
 
 @dataclass(frozen=True)
@@ -85,12 +87,17 @@ def lcm(
         yield Step(timestep, clean, latents)
 
 
-def consistency(schedule: Schedule, prediction: Tensor, noisy: Tensor, timestep: int) -> Tensor:
+def consistency(
+    schedule: Schedule, prediction: Tensor, noisy: Tensor, timestep: Int[Tensor, " objects"] | int
+) -> Tensor:
     """The consistency function: the clean latents, bent to be the identity at timestep 0 (Luo et al., equation 9)."""
-    data_deviation, scaled = 0.5, 10.0 * timestep
-    keep = data_deviation**2 / (scaled**2 + data_deviation**2)
-    give = scaled / math.sqrt(scaled**2 + data_deviation**2)
-    return keep * noisy + give * clean_from_prediction(schedule, prediction, noisy, timestep)
+    if isinstance(timestep, int):
+        timestep = torch.tensor([timestep])
+    scaled = (10.0 * timestep.double().cpu()).view((-1,) + (1,) * (noisy.ndim - 1))
+    keep = _DATA_DEVIATION**2 / (scaled**2 + _DATA_DEVIATION**2)
+    give = scaled / (scaled**2 + _DATA_DEVIATION**2).sqrt()
+    clean = clean_from_prediction(schedule, prediction, noisy, timestep)
+    return keep.to(noisy.dtype).to(noisy.device) * noisy + give.to(noisy.dtype).to(noisy.device) * clean
 
 
 def _signal_and_noise(schedule: Schedule, timestep: int | None) -> tuple[float, float]:

@@ -28,7 +28,7 @@ _MAX_DECODED = 768 * 2**20
 """Bytes that Pillow may hold for one picture before it is reduced."""
 
 # No PostScript: Pillow hands it to another program.
-_FORMATS = ("WEBP", "TIFF", "BMP", "TGA", "GIF", "PPM", "JPEG2000", "AVIF", "MPO")
+_FORMATS = ("WEBP", "TIFF", "BMP", "TGA", "GIF", "PPM", "JPEG2000", "AVIF")
 _DEEP_MODES = ("I", "F")
 _exr_reading = threading.Lock()
 

@@ -10,31 +10,27 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from mv3d_cli.diffusion.autoencoder import Autoencoder, Folding, Projection
 from mv3d_cli.diffusion.model import Model
 from mv3d_cli.diffusion.model.checkpoint import empty_model, load_model, save_model
-from mv3d_cli.diffusion.model.config import ModelConfig, config_from_text, small, text_from_config
+from mv3d_cli.diffusion.model.config import ModelConfig, config_from_text, small, text_from_config, tiny
 from mv3d_cli.errors import BadWeights, MissingInput, OutOfSpace
 
 
 @pytest.fixture
 def config(unet_config: dict[str, Any]) -> ModelConfig:
-    autoencoder = {
-        "in_channels": 12,
-        "out_channels": 12,
-        "latent_channels": 4,
-        "block_out_channels": (8, 8),
-        "down_block_types": ("DownEncoderBlock2D",) * 2,
-        "up_block_types": ("UpDecoderBlock2D",) * 2,
-        "norm_num_groups": 4,
-    }
+    projection = {"patch": 4, "channels": 4}
     tokens = {"size": 32, "patch": 16, "width": 12, "layers": 1, "heads": 2}
-    return ModelConfig(unet_config, autoencoder, tokens, patch=2, positions=True, picture_size=32)
+    return ModelConfig(unet_config, projection=projection, patch_tokens=tokens, positions=True, picture_size=32)
 
 
 @pytest.fixture
 def model(config: ModelConfig) -> Model:
+    """Its autoencoder is fitted."""
     torch.manual_seed(0)
-    return Model(config).eval()
+    model = Model(config).eval()
+    model.autoencoder.fit(torch.rand(4, 3, 32, 32) * 2 - 1)
+    return model
 
 
 @torch.no_grad()
@@ -50,17 +46,36 @@ def answer(model: Model) -> torch.Tensor:
 def test_small_is_small() -> None:
     model = empty_model(small())
     count = {name: sum(p.numel() for p in part.parameters()) for name, part in model.named_children()}
-    assert count == {"network": 24_146_728, "autoencoder": 3_059_640, "encoder": 1_925_568}
+    assert count == {"network": 9_523_361, "autoencoder": 0, "encoder": 1_333_056}
     assert sum(count.values()) <= 30_000_000
 
 
-def test_small_makes_latents_that_its_network_expects() -> None:
-    model = Model(replace(small(), patch_tokens={"size": 32, "patch": 16, "width": 192, "layers": 1, "heads": 3}))
-    latents = model.autoencoder.encode(torch.zeros(1, 3, 64, 64))
-    assert latents.shape == (1, 8, 8, 8)
-    condition = model.condition(torch.zeros(1, 3, 64, 64), torch.eye(4).expand(1, 1, 4, 4), torch.tensor([[0, 1]]))
-    with torch.no_grad():
-        assert model.network(torch.zeros(1, 2, 1, 8, 8, 8), torch.tensor([5]), condition).abs().max() > 0
+@torch.no_grad()
+@pytest.mark.parametrize(("preset", "shape"), [(small, (64, 16, 16)), (tiny, (48, 8, 8))])
+def test_a_presets_pictures_make_the_latents_that_its_network_expects(preset, shape: tuple[int, ...]) -> None:
+    config = preset()
+    model = Model(config)
+    picture = torch.randn(1, 3, config.picture_size, config.picture_size).clamp(-1, 1)
+    latents = model.autoencoder.encode(picture)
+    assert latents.shape == (1, *shape)
+    assert shape[0] == config.network["out_channels"] == config.network["in_channels"] // 2
+    assert shape[1] == config.network["sample_size"]
+    drafts = picture.expand(2, 3, -1, -1)[None, :, None]
+    condition = model.condition(picture, torch.eye(4).expand(1, 1, 4, 4), torch.tensor([[0, 1]]), drafts)
+    assert condition.photo_latent.shape == latents.shape
+    torch.nn.init.normal_(model.network.unet.conv_out.bias)
+    answer = model.network(torch.zeros(1, 2, 1, *shape), torch.tensor([5]), condition)
+    assert answer.shape == (1, 2, 1, *shape)
+    assert answer.abs().max() > 0
+    assert model.autoencoder.decode(answer).shape == (1, 2, 1, *picture.shape[1:])
+
+
+def test_a_model_has_the_autoencoder_of_its_configuration(config: ModelConfig, smallest: ModelConfig) -> None:
+    """Stable Diffusion's where there is one, else ours, else the squares themselves."""
+    kl = {"block_out_channels": (32,), "latent_channels": 4}
+    assert isinstance(Model(smallest).autoencoder, Folding)
+    assert isinstance(Model(config).autoencoder, Projection)
+    assert isinstance(Model(replace(config, autoencoder=kl, projection=None)).autoencoder, Autoencoder)
 
 
 def test_a_saved_model_gives_the_same_answer(model: Model, tmp_path: Path) -> None:
@@ -87,10 +102,11 @@ def test_half_precision_halves_the_file_and_hardly_moves_the_answer(model: Model
     assert 0 < (half - full).abs().mean() < 0.05 * full.abs().mean()
 
 
-def test_configurations_survive_json() -> None:
-    again = config_from_text(text_from_config(small()), "here")
-    assert text_from_config(again) == text_from_config(small())
-    assert again.noise == small().noise
+@pytest.mark.parametrize("preset", [small, tiny])
+def test_configurations_survive_json(preset) -> None:
+    again = config_from_text(text_from_config(preset()), "here")
+    assert text_from_config(again) == text_from_config(preset())
+    assert again.noise == preset().noise
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"noise": {}, "network": 3, "wheels": 4}', '{"noise": 5}'])
@@ -169,4 +185,4 @@ def test_when_the_disk_is_full_the_previous_model_survives(
         save_model(model, tmp_path)
     torch.testing.assert_close(answer(load_model(tmp_path)), before)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["config.json", "model.safetensors"]
-    assert json.loads((tmp_path / "config.json").read_text())["patch"] == 2
+    assert json.loads((tmp_path / "config.json").read_text())["picture_size"] == 32

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -61,7 +63,7 @@ def test_every_view_of_every_domain_gets_its_own_features() -> None:
 
 def test_dropout_hides_tokens_latent_and_both_equally_often() -> None:
     condition = drawn(20_000)
-    dropped = with_dropout(condition, torch.Generator().manual_seed(0), rate=0.05)
+    dropped = with_dropout(condition, torch.rand(20_000, generator=torch.Generator().manual_seed(0)), rate=0.05)
     no_tokens, no_latent = (dropped.tokens == 0).all((1, 2)), (dropped.photo_latent == 0).all((1, 2, 3))
     for hidden in (no_tokens & ~no_latent, no_latent & ~no_tokens, no_tokens & no_latent):
         assert abs(hidden.float().mean() - 0.05) < 0.006
@@ -75,3 +77,13 @@ def test_without_photo_keeps_cameras_and_tasks() -> None:
     assert both.tokens[:2].abs().max() == both.photo_latent[:2].abs().max() == 0
     torch.testing.assert_close(both.tokens[2:], condition.tokens)
     torch.testing.assert_close(view_features(both)[:2], view_features(condition))
+
+
+def test_drafts_are_never_hidden() -> None:
+    condition = replace(drawn(8), drafts=torch.ones(8, 2, 2, 4, 2, 2))
+    for hidden in (with_dropout(condition, torch.zeros(8), rate=0.3), without_photo(condition)):
+        assert hidden.tokens.abs().max() == 0
+        assert hidden.drafts is condition.drafts
+    both = stacked(without_photo(condition), condition)
+    assert both.drafts is not None
+    assert both.drafts.shape == (16, 2, 2, 4, 2, 2)

@@ -15,19 +15,26 @@ class ModelConfig:
     """The parts of a model.
 
     network       of diffusers' `UNet2DConditionModel`
-    autoencoder   of diffusers' `AutoencoderKL`, working on squares of `patch` pixels
+    autoencoder   of diffusers' `AutoencoderKL`, or None
+    projection    of our small autoencoder, or None
+    patch         where there is neither: side of the squares of pixels that are the latents
     patch_tokens  of our small photo encoder, or None
     clip          of the `CLIPVisionModelWithProjection` that stands in its place, or None
     positions     whether attention is told where in the picture its tokens are
+    views         names of the views that it was last taught, the photo's first; none: it was taught nothing
+    drafts        whether the network mends drafts of the views instead of looking at the photo's latent
     """
 
     network: dict[str, Any]
-    autoencoder: dict[str, Any]
+    autoencoder: dict[str, Any] | None = None
+    projection: dict[str, int] | None = None
     patch_tokens: dict[str, int] | None = None
     clip: dict[str, Any] | None = None
     noise: NoiseSettings = field(default_factory=NoiseSettings)
     patch: int = 1
     positions: bool = False
+    drafts: bool = False
+    views: tuple[str, ...] = ()
     picture_size: int = 256
 
 
@@ -40,7 +47,8 @@ def config_from_text(text: str, name: str) -> ModelConfig:
     """The inverse of `text_from_config`; `name` says whose it is. Raises BadWeights."""
     try:
         values = json.loads(text)
-        return ModelConfig(**values | {"noise": NoiseSettings(**values["noise"])})
+        parts = {"noise": NoiseSettings(**values["noise"]), "views": tuple(values.get("views", ()))}
+        return ModelConfig(**values | parts)
     except (ValueError, TypeError, KeyError) as error:
         raise BadWeights(
             f"{name} is not the configuration of a model: {error}", "copy the whole model folder again, or train anew"
@@ -48,37 +56,54 @@ def config_from_text(text: str, name: str) -> ModelConfig:
 
 
 def small() -> ModelConfig:
-    """The bundled model's: its parameters sit in transformer blocks at 16 x 16 and 8 x 8, where a CPU is fastest.
+    """The bundled model's: latents of 64 x 16 x 16, the parameters in transformer blocks at 8 x 8 and 4 x 4.
 
-    Matrix products in bf16 run about three times as efficiently as convolutions there. Latents are 8 x 32 x 32.
+    Matrix products in bf16 run about three times as efficiently as convolutions on a CPU, and few tokens keep joint
+    attention cheap.
     """
-    latent = 8
+    latent = 64
     return ModelConfig(
         network={
-            "sample_size": 32,
+            "sample_size": 16,
             "in_channels": 2 * latent,
             "out_channels": latent,
-            "block_out_channels": (64, 160, 256),
+            "block_out_channels": (32, 96, 192),
             "down_block_types": ("DownBlock2D", "CrossAttnDownBlock2D", "CrossAttnDownBlock2D"),
             "up_block_types": ("CrossAttnUpBlock2D", "CrossAttnUpBlock2D", "UpBlock2D"),
             "layers_per_block": 1,
-            "transformer_layers_per_block": (1, 1, 2),
+            "transformer_layers_per_block": (1, 1, 1),
             "attention_head_dim": (1, 2, 4),  # diffusers' name for the number of heads
             "cross_attention_dim": 192,
             "use_linear_projection": True,
         },
-        autoencoder={
-            "in_channels": 3 * 4**2,
-            "out_channels": 3 * 4**2,
-            "latent_channels": latent,
-            "block_out_channels": (96, 128),
-            "down_block_types": ("DownEncoderBlock2D",) * 2,
-            "up_block_types": ("UpDecoderBlock2D",) * 2,
-            "layers_per_block": 1,
-            "norm_num_groups": 16,
-            "scaling_factor": 1.0,
-        },
-        patch_tokens={"size": 256, "patch": 16, "width": 192, "layers": 3, "heads": 3},
-        patch=4,
+        projection={"patch": 16, "channels": latent},
+        patch_tokens={"size": 128, "patch": 16, "width": 192, "layers": 2, "heads": 3},
+        noise=NoiseSettings(prediction="sample"),
         positions=True,
+        drafts=True,
+    )
+
+
+def tiny() -> ModelConfig:
+    """For experiments and for trying out a data set: 32 x 32 pixels in squares of 4 x 4, no autoencoder."""
+    return ModelConfig(
+        network={
+            "sample_size": 8,
+            "in_channels": 2 * 48,
+            "out_channels": 48,
+            "block_out_channels": (96, 192),
+            "down_block_types": ("DownBlock2D", "CrossAttnDownBlock2D"),
+            "up_block_types": ("CrossAttnUpBlock2D", "UpBlock2D"),
+            "layers_per_block": 1,
+            "transformer_layers_per_block": 1,
+            "attention_head_dim": (2, 3),
+            "cross_attention_dim": 128,
+            "use_linear_projection": True,
+        },
+        patch_tokens={"size": 32, "patch": 4, "width": 128, "layers": 2, "heads": 2},
+        patch=4,
+        noise=NoiseSettings(prediction="sample"),
+        positions=True,
+        drafts=True,
+        picture_size=32,
     )

@@ -41,7 +41,7 @@ def model_from_stable_diffusion(source: str = DEFAULT_ID, dtype: torch.dtype = t
     The fresh layers come from torch's global generator. `HF_HOME` and `HF_HUB_OFFLINE` apply, as huggingface_hub asks.
     Raises MissingInput, BadWeights, MissingDependency.
     """
-    folder = _folder(source)
+    folder = folder_of(source)
     config = _config(folder)
     model = empty_model(config)
     unet = _weights(folder, "unet")
@@ -49,15 +49,15 @@ def model_from_stable_diffusion(source: str = DEFAULT_ID, dtype: torch.dtype = t
     reset_additions(model.network)
     fresh = {name: value for name, value in model.network.unet.state_dict().items() if value.device.type != "meta"}
     fill(model.network.unet, fresh | unet, f"{folder}/unet", dtype)
-    fill(model.autoencoder.kl, _new_attention_names(_weights(folder, "vae")), f"{folder}/vae", dtype)
+    fill(model.autoencoder.get_submodule("kl"), _new_attention_names(_weights(folder, "vae")), f"{folder}/vae", dtype)
     clip = _weights(folder, "image_encoder")
     clip.pop("vision_model.embeddings.position_ids", None)  # a constant that old versions saved
     fill(model.encoder.get_submodule("clip"), clip, f"{folder}/image_encoder", dtype)
     return model.to(dtype).eval()
 
 
-def _folder(source: str) -> Path:
-    """The folder itself, or the hub's copy of it on this disk."""
+def folder_of(source: str) -> Path:
+    """The folder itself, or the hub's copy of it on this disk. Raises MissingInput."""
     folder = Path(source)
     if folder.is_dir():
         return folder

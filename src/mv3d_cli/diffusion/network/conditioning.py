@@ -26,12 +26,13 @@ FEATURES = 12 * 2 * _OCTAVES + 2 * _TASK_REPEATS
 
 @dataclass(frozen=True)
 class Condition:
-    """Everything that is known of a batch of objects."""
+    """Everything that is known of a batch of objects; `drafts`, where the network mends them, of each view."""
 
     photo_latent: Float[Tensor, "objects channels height width"]
     tokens: Float[Tensor, "objects photo_tokens features"]
     world_from_camera: Float[Tensor, "objects views 4 4"]
     tasks: Int[Tensor, "objects domains"]
+    drafts: Float[Tensor, "objects domains views channels height width"] | None = None
 
 
 def camera_features(world_from_camera: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch features"]:
@@ -60,10 +61,12 @@ def view_features(condition: Condition) -> Float[Tensor, "objects domains views 
     return torch.cat([cameras[:, None].expand(*shape, -1), tasks[:, :, None].expand(*shape, -1).to(cameras)], dim=-1)
 
 
-def with_dropout(condition: Condition, generator: torch.Generator, rate: float = 0.05) -> Condition:
+def with_dropout(condition: Condition, draw: Float[Tensor, " objects"], rate: float = 0.05) -> Condition:
     """The condition with parts of the photo hidden: of `rate` of the objects the tokens, of as many the latent, of as
-    many both. `generator` lives on the CPU."""
-    draw = torch.rand(len(condition.tokens), generator=generator)
+    many both. `draw`: a number for each object, even over [0, 1).
+
+    Drafts are never hidden: without, what there is to add would be so much more that it drowned all else.
+    """
     hide_tokens = (draw < rate) | ((draw >= 2 * rate) & (draw < 3 * rate))
     hide_latent = (draw >= rate) & (draw < 3 * rate)
     return replace(
@@ -74,7 +77,7 @@ def with_dropout(condition: Condition, generator: torch.Generator, rate: float =
 
 
 def without_photo(condition: Condition) -> Condition:
-    """The condition with the photo hidden: what guidance leads away from."""
+    """The condition with the photo hidden, but for its drafts: what guidance leads away from."""
     everyone = torch.ones(len(condition.tokens), dtype=torch.bool)
     return replace(
         condition,
@@ -90,7 +93,12 @@ def stacked(first: Condition, second: Condition) -> Condition:
         tokens=torch.cat([first.tokens, second.tokens]),
         world_from_camera=torch.cat([first.world_from_camera, second.world_from_camera]),
         tasks=torch.cat([first.tasks, second.tasks]),
+        drafts=_joined(first.drafts, second.drafts),
     )
+
+
+def _joined(first: Tensor | None, second: Tensor | None) -> Tensor | None:
+    return None if first is None or second is None else torch.cat([first, second])
 
 
 def _hidden(values: Tensor, objects: Tensor) -> Tensor:

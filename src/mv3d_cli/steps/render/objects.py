@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import warp
-from jaxtyping import Float
 
+from mv3d_cli.capture.framing import placed, random_turn
 from mv3d_cli.capture.lighting import light_for
 from mv3d_cli.capture.rendering import render
 from mv3d_cli.capture.shapes import procedural_mesh
 from mv3d_cli.capture.sheet import sheet_of_objects, sheet_of_views
-from mv3d_cli.errors import BadMesh, InputError, MissingDependency, MissingInput, Mv3dError, UsageError, WorkFailed
+from mv3d_cli.errors import InputError, MissingDependency, MissingInput, Mv3dError, UsageError, WorkFailed
 from mv3d_cli.formats.cameras import load_cameras, select
 from mv3d_cli.formats.images import read_image, write_png
 from mv3d_cli.formats.meshes import MeshFile, find_meshes, mesh_sources, read_mesh
@@ -28,7 +28,6 @@ from mv3d_cli.formats.views_folder import write_views
 from mv3d_cli.kernels.runtime import cpu_count, in_threads, use_threads
 from mv3d_cli.mapping import Outcome, map_items, map_on_ray
 from mv3d_cli.scene.camera import Camera
-from mv3d_cli.scene.mesh import Mesh, transform, unit_sphere_from_mesh
 from mv3d_cli.scene.views import Views
 from mv3d_cli.steps.settings import Progress, Tell, Warned
 from mv3d_cli.store import digest_of_file, ran_out_of_space
@@ -197,7 +196,7 @@ def _draw(
         mesh = procedural_mesh(item.seed) if item.file is None else read_mesh(item.file, config.up)
     notes = [f"{item.name}: {warning.message}" for warning in caught]
     turned = np.eye(4) if turn is None else random_turn(rng, config.tilt)
-    mesh, world_from_mesh = _placed(mesh, turned)
+    mesh, world_from_mesh = placed(mesh, turned)
     light = light_for(config.lighting, rng)
     views = _engine(config)(mesh, rig, config.size, light)
     folder.mkdir(parents=True, exist_ok=True)
@@ -224,26 +223,6 @@ def _engine(config: Config) -> Callable[..., Views]:
 
         return partial(render_with_blender, samples=config.samples)
     return partial(render, device="cuda:0" if config.device == "cuda" else config.device)
-
-
-def _placed(mesh: Mesh, turned: Float[np.ndarray, "4 4"]) -> tuple[Mesh, Float[np.ndarray, "4 4"]]:
-    """The mesh turned and brought into the unit sphere, and the similarity that did it. Raises BadMesh."""
-    moved = transform(mesh, turned)
-    similarity = unit_sphere_from_mesh(moved)
-    if not np.isfinite(similarity).all():
-        raise BadMesh("the mesh has no extent", "all of its vertices lie in one place; check the file")
-    return transform(moved, similarity), similarity @ turned
-
-
-def random_turn(rng: np.random.Generator, tilt: float) -> Float[np.ndarray, "4 4"]:
-    """A turn about +Z, even over the circle, then a tip of up to `tilt` degrees about a random horizontal axis."""
-    from scipy.spatial.transform import Rotation
-
-    axis = rng.uniform(0, 2 * np.pi)
-    tip = Rotation.from_rotvec(np.deg2rad(rng.uniform(0, tilt)) * np.array([np.cos(axis), np.sin(axis), 0.0]))
-    turned = np.eye(4)
-    turned[:3, :3] = (tip * Rotation.from_euler("z", rng.uniform(0, 2 * np.pi))).as_matrix()
-    return turned
 
 
 def _failure(outcome: Outcome) -> dict[str, Any]:

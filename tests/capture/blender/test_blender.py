@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 from mv3d_cli.capture import blender, rendering
-from mv3d_cli.capture.blender_scene import SKY_ROWS, sky_of
+from mv3d_cli.capture.blender.scene import SKY_ROWS, sky_of
 from mv3d_cli.capture.lighting import COSINE_OVER_PI, ambient_from_lamps, harmonics, studio
 from mv3d_cli.capture.shapes import procedural_mesh
 from mv3d_cli.errors import MissingDependency

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from mv3d_cli.capture.blender_scene import add_eye, add_light, add_mesh, aim
+from mv3d_cli.capture.blender.scene import add_eye, add_light, add_mesh, aim
 from mv3d_cli.errors import MissingDependency, WorkFailed
 from mv3d_cli.kernels.runtime import discarded, threads
 from mv3d_cli.kernels.shade import Light
