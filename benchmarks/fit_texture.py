@@ -20,12 +20,13 @@ from pathlib import Path
 import numpy as np
 
 from mv3d_cli.capture.rendering import render
-from mv3d_cli.formats.cameras import HORIZONTAL, load_cameras
+from mv3d_cli.formats.cameras import load_cameras
 from mv3d_cli.formats.images import write_png
 from mv3d_cli.formats.meshes import find_meshes, read_mesh
 from mv3d_cli.formats.views_folder import write_views
 from mv3d_cli.metrics.image import psnr
 from mv3d_cli.scene.camera import Camera, Orthographic, direction_on_sphere, look_at_origin
+from mv3d_cli.scene.rig import HORIZONTAL
 from mv3d_cli.scene.views import Views
 from reconstruction_scores import SCANS, rig
 from shared_data import scanned_mesh, shared, table

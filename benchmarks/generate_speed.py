@@ -66,9 +66,9 @@ def warm(photo: Path, runs: int) -> dict[str, list[float]]:
         mask = timed("cut the object out", cut_out, pixels)
         cut = np.dstack([pixels[..., :3], mask])
         frame = timed("frame it", framed, cut, model.config.picture_size, 0.7)
-        timed("the drafts, which are a part of the next", draft_views, frame, cameras)
+        draft = timed("the draft of 8 views", draft_views, frame, cameras)
         for steps in (1, 4):
-            answer = timed(f"the model, steps: {steps}", answered, model, frame, cameras, Config(steps=steps))
+            answer = timed(f"the model, steps: {steps}", answered, model, frame, draft, Config(steps=steps))
         timed("views of its answer", views_of, frame, cameras, answer, silent)
     return found
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from mv3d_cli.capture.rendering import render
-from mv3d_cli.formats.cameras import HORIZONTAL, load_cameras, select
+from mv3d_cli.formats.cameras import load_cameras, select
 from mv3d_cli.meshes.bake import bake, balanced
 from mv3d_cli.meshes.repair import watertight, without_floaters
 from mv3d_cli.meshes.shots import Shot
@@ -26,6 +26,7 @@ from mv3d_cli.meshes.surface import surface_of_grid
 from mv3d_cli.meshes.unwrap import unwrapped
 from mv3d_cli.scene.camera import Orthographic, direction_on_sphere, look_at_origin
 from mv3d_cli.scene.mesh import Material, Mesh
+from mv3d_cli.scene.rig import HORIZONTAL
 from mv3d_cli.scene.views import Views
 from shared_data import scanned_mesh, table
 

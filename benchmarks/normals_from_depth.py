@@ -12,10 +12,11 @@ import numpy as np
 
 from mv3d_cli.capture.normals import normals_from_depth, paper_normals
 from mv3d_cli.capture.rendering import render
-from mv3d_cli.formats.cameras import HORIZONTAL, load_cameras, select
+from mv3d_cli.formats.cameras import load_cameras, select
 from mv3d_cli.formats.meshes import find_meshes, read_mesh
 from mv3d_cli.scene.camera import Camera
 from mv3d_cli.scene.conventions import normal_from_bytes
+from mv3d_cli.scene.rig import HORIZONTAL
 from shared_data import in_unit_sphere, shared, table
 
 SIZE = 256

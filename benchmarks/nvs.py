@@ -21,7 +21,7 @@ import numpy as np
 
 from mv3d_cli.capture.examples import Example, pictures_of
 from mv3d_cli.capture.sheet import sheet_of_rows
-from mv3d_cli.capture.sheets import views_between
+from mv3d_cli.capture.solid import views_between
 from mv3d_cli.diffusion.generation import Sampling
 from mv3d_cli.diffusion.model import Model
 from mv3d_cli.diffusion.model.checkpoint import load_model, record_of_weights, weights_of

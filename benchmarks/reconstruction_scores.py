@@ -8,13 +8,14 @@ import numpy as np
 
 from mv3d_cli.capture.lighting import studio
 from mv3d_cli.capture.rendering import render
-from mv3d_cli.formats.cameras import HORIZONTAL, load_cameras, select
+from mv3d_cli.formats.cameras import load_cameras, select
 from mv3d_cli.formats.images import read_image
 from mv3d_cli.formats.meshes import MeshFile, MeshWarning, read_mesh
 from mv3d_cli.kernels.rasterize import rasterize
 from mv3d_cli.metrics.shape import ShapeScores, Surface, outer_surface, shape_scores
 from mv3d_cli.scene.camera import Camera, projected
 from mv3d_cli.scene.mesh import Mesh, transform
+from mv3d_cli.scene.rig import HORIZONTAL
 from mv3d_cli.scene.views import View, Views
 from shared_data import scanned_mesh, shared
 

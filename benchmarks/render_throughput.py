@@ -17,8 +17,8 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from mv3d_cli.formats.cameras import HORIZONTAL
 from mv3d_cli.formats.meshes import SUFFIXES
+from mv3d_cli.scene.rig import HORIZONTAL
 from shared_data import empty_cache, shared, table
 
 JOBS = 2

@@ -11,11 +11,12 @@ from skimage import data
 from mv3d_cli.capture.rendering import render
 from mv3d_cli.diffusion.model.checkpoint import record_of_weights, weights_of
 from mv3d_cli.formats.assets import asset
-from mv3d_cli.formats.cameras import HORIZONTAL, load_cameras, select
+from mv3d_cli.formats.cameras import load_cameras, select
 from mv3d_cli.formats.meshes import find_meshes, read_mesh
 from mv3d_cli.formats.views_folder import read_views
 from mv3d_cli.meshes.repair import watertight
 from mv3d_cli.metrics.overlap import iou
+from mv3d_cli.scene.rig import HORIZONTAL
 
 CUP = Path(data.__path__[0]) / "coffee.png"
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mv3d_cli.formats.cameras import HORIZONTAL
 from mv3d_cli.formats.images import read_depth, read_image
 from mv3d_cli.formats.views_folder import read_views
+from mv3d_cli.scene.rig import HORIZONTAL
 
 RIG = [*HORIZONTAL, "top", "front_right_top", "front_left_top", "back_right_top"]
 SMALL = ("--size", 32)

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
+from mv3d_cli.diffusion.devices import has_quick_bf16
 from mv3d_cli.diffusion.model.checkpoint import load_model
-from mv3d_cli.diffusion.precision import has_quick_bf16
 from mv3d_cli.formats.images import read_image
 
 TINY = ("train", "--preset", "tiny", "--procedural", "3", "--batch", "2", "--steps", "3", "--jobs", "0")

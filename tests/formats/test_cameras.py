@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from mv3d_cli.errors import BadCameras, MissingInput
 from mv3d_cli.formats import assets, cameras
 from mv3d_cli.scene.camera import Camera, Orthographic, Perspective, look_at_origin
+from mv3d_cli.scene.rig import HORIZONTAL
 
 SHARED = Path(os.environ.get("MV3D_SHARED", Path(__file__).resolve().parents[3] / "shared"))
 
@@ -40,8 +41,8 @@ def test_names_say_where_a_camera_is(name):
 
 
 def test_the_eight_horizontal_ones():
-    chosen = cameras.select(cameras.load_cameras(), cameras.HORIZONTAL)
-    assert [camera.name for camera in chosen] == list(cameras.HORIZONTAL)
+    chosen = cameras.select(cameras.load_cameras(), HORIZONTAL)
+    assert [camera.name for camera in chosen] == list(HORIZONTAL)
     assert all(abs(camera.world_from_camera[2, 3]) < 1e-12 for camera in chosen)
     assert len(chosen) == 8
 

@@ -13,10 +13,11 @@ from mv3d_cli.capture.rendering import render
 from mv3d_cli.errors import BadViews, DamagedArtifact, MissingInput, UsageError
 from mv3d_cli.fields.alignment import Alignment
 from mv3d_cli.fields.alignment.warps import Warp, still
-from mv3d_cli.formats.cameras import HORIZONTAL, load_cameras, select
+from mv3d_cli.formats.cameras import load_cameras, select
 from mv3d_cli.meshes.repair import watertight
 from mv3d_cli.meshes.surface import mesh_of as bare_mesh
 from mv3d_cli.scene.mesh import Mesh, transform
+from mv3d_cli.scene.rig import HORIZONTAL
 from mv3d_cli.scene.views import Views
 from mv3d_cli.steps.fit_sdf import Config
 from mv3d_cli.steps.fit_sdf.building import fitted

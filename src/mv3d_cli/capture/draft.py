@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from mv3d_cli.capture.rendering import render
-from mv3d_cli.capture.sheets import Sheet, reduced, solid_between
+from mv3d_cli.capture.solid import Sheet, reduced, solid_between
 from mv3d_cli.scene.camera import Camera
 from mv3d_cli.scene.mesh import Mesh
 from mv3d_cli.scene.views import Views

@@ -32,11 +32,6 @@ from mv3d_cli.scene.camera import (
 )
 from mv3d_cli.scene.conventions import OPENCV_FROM_OPENGL
 
-HORIZONTAL = (
-    "front", "back", "right", "left", "front_right", "front_left", "back_right", "back_left",
-)  # fmt: skip
-"""The rig's cameras at the height of the object, which are the ones generated."""
-
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
 _PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
 _ORTHOGRAPHIC = ("ORTHOGRAPHIC", "ORTHOPHOTO")

@@ -11,9 +11,10 @@ from mv3d_cli.fields.fitting import Config, Fit, fit
 from mv3d_cli.fields.fusion import fuse
 from mv3d_cli.fields.relief import Relief, reliefs_of
 from mv3d_cli.fields.sdf import Field
-from mv3d_cli.formats.cameras import HORIZONTAL, load_cameras, select
+from mv3d_cli.formats.cameras import load_cameras, select
 from mv3d_cli.kernels.hash_grid import Layout
 from mv3d_cli.scene.camera import pixel_from_camera
+from mv3d_cli.scene.rig import HORIZONTAL
 from mv3d_cli.scene.views import View, Views
 
 RADIUS, SIZE = 0.6, 64

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
+from mv3d_cli.capture.photo.framing import INSIDE
 from mv3d_cli.capture.photo.matting import alpha_of, labelled
 from mv3d_cli.errors import BadImage
 
 LEAST_SIDE = 16  # pixels of a photo
-INSIDE = 128  # least alpha of a pixel that belongs to the object
 
 _SECOND = 0.35  # of the larger object's area: what is less is an accessory
 _GAP = 0.03  # of the longest side: what is nearer belongs together

@@ -68,9 +68,9 @@ class MultiViewUNet(nn.Module):
 
     def _before(self, latents: Tensor, timestep: Tensor, condition: Condition) -> tuple[Tensor, Tensor]:
         """What the U-Net is shown: of the noisy latents, and beside them."""
-        if self.mending is None or condition.drafts is None:
+        if self.mending is None:
             return latents, condition.photo_latent[:, None, None].expand_as(latents).to(latents)
-        return self.mending.surprise(latents, timestep, condition), condition.drafts.to(latents)
+        return self.mending.surprise(latents, timestep, condition), self.mending.drafts(condition, latents)
 
 
 def colour_depth_parameters(network: MultiViewUNet) -> Iterator[nn.Parameter]:

@@ -71,6 +71,13 @@ class Mending(nn.Module):
         _, trusted, deviation = self._expected(condition, noisy)
         return (noisy - alpha * trusted) / (alpha**2 * deviation**2 + sigma**2).sqrt()
 
+    @staticmethod
+    def drafts(condition: Condition, like: Tensor) -> Latents:
+        """The drafts of a condition, of the device and dtype of `like`. Raises ValueError where there are none."""
+        if condition.drafts is None:
+            raise ValueError("this network mends drafts, and there are none")
+        return condition.drafts.to(like)
+
     def clean(self, answer: Answer, condition: Condition) -> Latents:
         """The clean latents.
 
@@ -82,9 +89,7 @@ class Mending(nn.Module):
 
     def _expected(self, condition: Condition, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(the drafts, their trusted share, deviation of clean latents from it). Raises ValueError without drafts."""
-        if condition.drafts is None:
-            raise ValueError("this network mends drafts, and there are none")
-        weights, drafts = between_turns(condition.world_from_camera), condition.drafts.to(like)
+        weights, drafts = between_turns(condition.world_from_camera), self.drafts(condition, like)
         trust, deviation = (_told(part[condition.tasks], weights).to(like) for part in (self.trust, self.deviation))
         return drafts, trust * drafts, deviation
 

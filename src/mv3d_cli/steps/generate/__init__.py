@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from mv3d_cli.errors import UsageError
+from mv3d_cli.scene.rig import HORIZONTAL
 from mv3d_cli.steps.settings import Between, Doc, Runtime, Tell, Warned, check, key_config, silent
 from mv3d_cli.store import Artifact, Recipe, produce
 
@@ -23,7 +24,6 @@ Sampler = Literal["lcm", "ddim", "dpm"]
 Device = Literal["auto", "cpu", "cuda", "mps"]
 Precision = Literal["auto", "fp32", "bf16"]
 
-HORIZONTAL = ("front", "back", "right", "left", "front_right", "front_left", "back_right", "back_left")
 FRONT, BACK = HORIZONTAL[:2]
 KEEP = "keep"
 

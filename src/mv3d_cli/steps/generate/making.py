@@ -13,14 +13,14 @@ from mv3d_cli.capture.draft import draft_views
 from mv3d_cli.capture.examples import BACKGROUNDS, composited, pictures_of, poses_of
 from mv3d_cli.capture.photo.framing import INSIDE, framed
 from mv3d_cli.capture.sheet import sheet_of_views
-from mv3d_cli.capture.sheets import views_between
+from mv3d_cli.capture.solid import views_between
 from mv3d_cli.diffusion.autoencoder import pictures_from_bytes, stacked_pictures
+from mv3d_cli.diffusion.devices import device_of, has_quick_bf16
 from mv3d_cli.diffusion.generation import Sampling, generated
 from mv3d_cli.diffusion.model import Model
 from mv3d_cli.diffusion.model.checkpoint import load_model
 from mv3d_cli.diffusion.model.stable_diffusion import model_from_stable_diffusion
-from mv3d_cli.diffusion.precision import has_quick_bf16
-from mv3d_cli.errors import UsageError, WorkFailed
+from mv3d_cli.errors import WorkFailed
 from mv3d_cli.formats.cameras import load_cameras, select
 from mv3d_cli.formats.images import write_png
 from mv3d_cli.formats.views_folder import write_views
@@ -66,27 +66,28 @@ def views_by(model: Model, photo: Photograph, cameras: Sequence[Camera], config:
     cancel in part. Raises WorkFailed where the model sees no object."""
     names = model.config.views
     others = [camera for camera in cameras if camera.name not in names]
-    if not {FRONT, BACK} <= set(names) or not others:
-        return views_of(photo, cameras, answered(model, photo, cameras, config), tell)
-    asked = select(load_cameras(), (FRONT, *(name for name in names if name != FRONT)))
-    made = views_of(photo, asked, answered(model, photo, asked, config), tell)
+    unfolds = bool(others) and {FRONT, BACK} <= set(names)
+    asked = select(load_cameras(), (FRONT, *(name for name in names if name != FRONT))) if unfolds else cameras
+    draft = draft_views(photo, asked)
+    made = views_of(photo, asked, answered(model, photo, draft, config), tell)
+    if not unfolds:
+        return made
     known = {view.camera.name: view for view in made.frames}
-    if BACK in known:
-        guesses = draft_views(photo, [known[name].camera for name in (FRONT, BACK)]).frames
-        known |= {view.camera.name: halfway(known[view.camera.name], view) for view in guesses}
-        drawn = views_between(known[FRONT], known[BACK], others)
-        known |= {view.camera.name: unfolded(view, known[BACK].weight) for view in drawn.frames}
+    guesses = {view.camera.name: view for view in draft.frames}
+    front, back = (halfway(known[name], guesses[name]) for name in (FRONT, BACK))
+    known |= {FRONT: front, BACK: back}
+    known |= {view.camera.name: unfolded(view, back.weight) for view in views_between(front, back, others).frames}
     return Views(tuple(known[camera.name] for camera in cameras if camera.name in known))
 
 
-def answered(model: Model, photo: Photograph, cameras: Sequence[Camera], config: Config) -> Answer:
-    """(colours, depths) of the photo's views, as the model has them, on white."""
+def answered(model: Model, photo: Photograph, draft: Views, config: Config) -> Answer:
+    """(colours, depths) of the draft's views of the photo, as the model has them, on white."""
     device = next(model.parameters()).device
     picture = pictures_from_bytes(torch.from_numpy(composited(photo, _WHITE)))[None].to(device)
-    poses = torch.from_numpy(poses_of(cameras))[None].to(device)
+    poses = torch.from_numpy(poses_of([view.camera for view in draft.frames]))[None].to(device)
     drafts = None
     if model.config.drafts:
-        color, depth = pictures_of(draft_views(photo, cameras), _WHITE)
+        color, depth = pictures_of(draft, _WHITE)
         drafts = stacked_pictures(torch.from_numpy(color), torch.from_numpy(depth))[None].to(device)
     sampling = Sampling(config.steps, config.sampler, config.guidance, config.seed)
     half = is_half(config.dtype, device)
@@ -115,14 +116,6 @@ def views_of(photo: Photograph, cameras: Sequence[Camera], answer: Answer, tell:
         else:
             tell(Warned(f"the model sees nothing in the view {camera.name}: it is left out"))
     return Views(tuple(frames))
-
-
-def device_of(name: str) -> torch.device:
-    """The device of that name; auto: a GPU where there is one. Raises UsageError."""
-    here = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
-    if not here.get(name, True):
-        raise UsageError(f"--device {name}: there is no such device here", "leave it out, or take --device cpu")
-    return torch.device(next((kind for kind in here if here[kind]), "cpu") if name == "auto" else name)
 
 
 def is_half(dtype: str, device: torch.device) -> bool:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from mv3d_cli.errors import UsageError
+from mv3d_cli.scene.rig import HORIZONTAL
 from mv3d_cli.steps.settings import Between, Doc, Runtime, Tell, check, silent
 from mv3d_cli.store import Artifact
 
@@ -29,8 +30,6 @@ Lighting = Literal["random", "studio", "none"]
 Device = Literal["auto", "cpu", "cuda", "mps"]
 Precision = Literal["auto", "bf16", "fp32"]
 Up = Literal["auto", "y", "z"]
-
-HORIZONTAL = ("front", "back", "right", "left", "front_right", "front_left", "back_right", "back_left")
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from mv3d_cli.diffusion.devices import has_quick_bf16
 from mv3d_cli.diffusion.model.checkpoint import AUTOENCODER
-from mv3d_cli.diffusion.precision import has_quick_bf16
 from mv3d_cli.errors import UsageError
 from mv3d_cli.steps.settings import Tell, Warned, key_config, settings_of, silent
 from mv3d_cli.steps.train import VERSION, Config

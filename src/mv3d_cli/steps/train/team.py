@@ -9,17 +9,14 @@ import torch
 from accelerate import Accelerator
 from accelerate.utils import broadcast_object_list
 
-from mv3d_cli.errors import UsageError
+from mv3d_cli.diffusion.devices import device_of
 
 
 class Team:
     """The processes of a training and the device of this one. Raises UsageError for a device that is not here."""
 
     def __init__(self, device: str):
-        here = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
-        if not here.get(device, True):
-            raise UsageError(f"--device {device}: there is no such device here", "leave it out, or take --device cpu")
-        self.accelerator = Accelerator(cpu=device == "cpu" or (device == "auto" and not any(here.values())))
+        self.accelerator = Accelerator(cpu=device_of(device).type == "cpu")
         self.device: torch.device = self.accelerator.device
         self.size, self.rank = self.accelerator.num_processes, self.accelerator.process_index
         self.first = self.accelerator.is_main_process

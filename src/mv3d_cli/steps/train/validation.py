@@ -12,9 +12,9 @@ from jaxtyping import UInt8
 from mv3d_cli.capture.examples import Drawing, Example
 from mv3d_cli.capture.sheet import sheet_of_rows
 from mv3d_cli.diffusion.autoencoder import depth_from_pictures, pictures_from_bytes, stacked_pictures
+from mv3d_cli.diffusion.devices import has_quick_bf16
 from mv3d_cli.diffusion.generation import Sampling, generated
 from mv3d_cli.diffusion.model import Model
-from mv3d_cli.diffusion.precision import has_quick_bf16
 from mv3d_cli.errors import InputError, MissingInput
 from mv3d_cli.metrics.depth import depth_error
 from mv3d_cli.metrics.image import psnr

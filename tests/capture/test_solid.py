@@ -10,7 +10,7 @@ import pytest
 from mv3d_cli.capture.lighting import studio
 from mv3d_cli.capture.rendering import render
 from mv3d_cli.capture.shapes import procedural_mesh
-from mv3d_cli.capture.sheets import views_between
+from mv3d_cli.capture.solid import views_between
 from mv3d_cli.formats.cameras import load_cameras, select
 from mv3d_cli.metrics.image import psnr
 from mv3d_cli.metrics.overlap import iou
